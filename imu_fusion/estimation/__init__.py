@@ -1,0 +1,1 @@
+"""The estimators: pure classes, no ROS, no files, no clock, no plotting."""

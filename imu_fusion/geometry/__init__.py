@@ -1,0 +1,1 @@
+"""Rotations, geodesy, gravity and the magnetic field. No ROS, no files."""

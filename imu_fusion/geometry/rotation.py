@@ -1,0 +1,204 @@
+"""Rotation kernels for hot loops (numba, scalar, no broadcasting).
+
+Quaternions are Hamilton, active, ``x, y, z, w``. Arrays are float64 and
+one-dimensional; whole logs are better served by ``scipy.spatial.transform``.
+The exponential and the logarithm switch to series near zero, where the closed
+forms lose digits.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+# Below this angle the truncated series are exact to float64 rounding:
+# the first neglected term is of the order angle^6 / 5040 of the value.
+_SMALL = 1e-3
+
+
+@njit(cache=True)
+def skew(v):
+    """Matrix [v]x with ``skew(v) @ u == cross(v, u)``. v: (3,). Returns (3, 3)."""
+    m = np.zeros((3, 3))
+    m[0, 1] = -v[2]
+    m[0, 2] = v[1]
+    m[1, 0] = v[2]
+    m[1, 2] = -v[0]
+    m[2, 0] = -v[1]
+    m[2, 1] = v[0]
+    return m
+
+
+@njit(cache=True)
+def quat_multiply(p, q):
+    """Hamilton product p * q. p, q: (4,). Returns (4,)."""
+    r = np.empty(4)
+    r[0] = p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1]
+    r[1] = p[3] * q[1] - p[0] * q[2] + p[1] * q[3] + p[2] * q[0]
+    r[2] = p[3] * q[2] + p[0] * q[1] - p[1] * q[0] + p[2] * q[3]
+    r[3] = p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2]
+    return r
+
+
+@njit(cache=True)
+def quat_conjugate(q):
+    """Inverse of a unit quaternion. q: (4,). Returns (4,)."""
+    r = np.empty(4)
+    r[0] = -q[0]
+    r[1] = -q[1]
+    r[2] = -q[2]
+    r[3] = q[3]
+    return r
+
+
+@njit(cache=True)
+def quat_normalize(q):
+    """q scaled to unit length. q: (4,), not zero. Returns (4,)."""
+    return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+
+
+@njit(cache=True)
+def quat_to_matrix(q):
+    """Rotation matrix of a unit quaternion. q: (4,). Returns (3, 3)."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    m = np.empty((3, 3))
+    m[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    m[0, 1] = 2.0 * (x * y - z * w)
+    m[0, 2] = 2.0 * (x * z + y * w)
+    m[1, 0] = 2.0 * (x * y + z * w)
+    m[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    m[1, 2] = 2.0 * (y * z - x * w)
+    m[2, 0] = 2.0 * (x * z - y * w)
+    m[2, 1] = 2.0 * (y * z + x * w)
+    m[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    return m
+
+
+@njit(cache=True)
+def quat_from_matrix(m):
+    """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978).
+
+    m: (3, 3). Returns (4,) with a non-negative largest component.
+    """
+    q = np.empty(4)
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    largest = 3
+    best = trace
+    for i in range(3):
+        if m[i, i] > best:
+            best = m[i, i]
+            largest = i
+    if largest == 3:
+        s = 2.0 * math.sqrt(1.0 + trace)
+        q[0] = (m[2, 1] - m[1, 2]) / s
+        q[1] = (m[0, 2] - m[2, 0]) / s
+        q[2] = (m[1, 0] - m[0, 1]) / s
+        q[3] = 0.25 * s
+    else:
+        i = largest
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        s = 2.0 * math.sqrt(1.0 + m[i, i] - m[j, j] - m[k, k])
+        q[i] = 0.25 * s
+        q[j] = (m[j, i] + m[i, j]) / s
+        q[k] = (m[k, i] + m[i, k]) / s
+        q[3] = (m[k, j] - m[j, k]) / s
+    return quat_normalize(q)
+
+
+@njit(cache=True)
+def quat_rotate(q, v):
+    """v turned by the unit quaternion q. q: (4,), v: (3,). Returns (3,)."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    tx = 2.0 * (y * v[2] - z * v[1])
+    ty = 2.0 * (z * v[0] - x * v[2])
+    tz = 2.0 * (x * v[1] - y * v[0])
+    r = np.empty(3)
+    r[0] = v[0] + w * tx + y * tz - z * ty
+    r[1] = v[1] + w * ty + z * tx - x * tz
+    r[2] = v[2] + w * tz + x * ty - y * tx
+    return r
+
+
+@njit(cache=True)
+def quat_rotate_inverse(q, v):
+    """v turned by the inverse of the unit quaternion q. Returns (3,)."""
+    return quat_rotate(quat_conjugate(q), v)
+
+
+@njit(cache=True)
+def quat_exp(phi):
+    """Unit quaternion of a rotation vector. phi: (3,) rad. Returns (4,)."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = math.sqrt(angle2)
+    if angle < _SMALL:
+        s = 0.5 - angle2 / 48.0 + angle2 * angle2 / 3840.0
+    else:
+        s = math.sin(0.5 * angle) / angle
+    q = np.empty(4)
+    q[0] = s * phi[0]
+    q[1] = s * phi[1]
+    q[2] = s * phi[2]
+    q[3] = math.cos(0.5 * angle)
+    return q
+
+
+@njit(cache=True)
+def quat_log(q):
+    """Rotation vector of a unit quaternion, of angle at most pi. Returns (3,) rad."""
+    n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
+    n = math.sqrt(n2)
+    sign = 1.0 if q[3] >= 0.0 else -1.0
+    w = abs(q[3])
+    if n < _SMALL:
+        t = n / w
+        s = 2.0 / w * (1.0 - t * t / 3.0 + t ** 4 / 5.0)
+    else:
+        s = 2.0 * math.atan2(n, w) / n
+    phi = np.empty(3)
+    phi[0] = sign * s * q[0]
+    phi[1] = sign * s * q[1]
+    phi[2] = sign * s * q[2]
+    return phi
+
+
+@njit(cache=True)
+def so3_exp(phi):
+    """Rotation matrix of a rotation vector. phi: (3,) rad. Returns (3, 3)."""
+    return quat_to_matrix(quat_exp(phi))
+
+
+@njit(cache=True)
+def so3_log(m):
+    """Rotation vector of a rotation matrix. m: (3, 3). Returns (3,) rad."""
+    return quat_log(quat_from_matrix(m))
+
+
+@njit(cache=True)
+def right_jacobian(phi):
+    """J with ``Exp(phi + d) = Exp(phi) Exp(J d)`` to first order. Returns (3, 3)."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = math.sqrt(angle2)
+    if angle < 1e-2:
+        # (1 - cos a) / a^2 and (a - sin a) / a^3 cancel badly near zero.
+        b = 0.5 - angle2 / 24.0 + angle2 * angle2 / 720.0
+        c = 1.0 / 6.0 - angle2 / 120.0 + angle2 * angle2 / 5040.0
+    else:
+        b = (1.0 - math.cos(angle)) / angle2
+        c = (angle - math.sin(angle)) / (angle2 * angle)
+    k = skew(phi)
+    return np.eye(3) - b * k + c * (k @ k)
+
+
+@njit(cache=True)
+def right_jacobian_inverse(phi):
+    """Inverse of :func:`right_jacobian`, for angles below 2 pi. Returns (3, 3)."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = math.sqrt(angle2)
+    if angle < 1e-2:
+        c = 1.0 / 12.0 + angle2 / 720.0 + angle2 * angle2 / 30240.0
+    else:
+        half = 0.5 * angle
+        c = (1.0 - half * math.cos(half) / math.sin(half)) / angle2
+    k = skew(phi)
+    return np.eye(3) + 0.5 * k + c * (k @ k)

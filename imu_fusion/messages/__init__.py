@@ -1,0 +1,1 @@
+"""Messages and bags: samples and estimates to and from ROS types."""

@@ -1,0 +1,1 @@
+"""ROS 2 nodes: thin adapters that decode, call an estimator and encode."""

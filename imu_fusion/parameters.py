@@ -1,0 +1,222 @@
+"""Parameters of estimators and nodes: declared once, as a frozen dataclass.
+
+Name, default, unit, bounds and meaning live in the dataclass field. ROS
+parameter declarations, YAML parsing, command line help and the tables of the
+README are all derived from it.
+
+    @dataclass(frozen=True)
+    class OrientationParams(Parameters):
+        gyr_noise_density: float = param(1e-3, unit="rad/s/sqrt(Hz)", low=0, doc="...")
+
+A field whose type allows ``None`` is *unset* by default: the estimator finds
+the value itself.
+"""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+
+from imu_fusion.errors import ParameterError
+
+
+def param(default, *, doc, unit="", low=None, high=None, choices=None, length=None,
+          read_only=True):
+    """Declare one parameter as a dataclass field.
+
+    Args:
+        default: value when nothing is given; ``None`` means unset.
+        doc: meaning, one sentence.
+        unit: unit of the value as it is set.
+        low, high: inclusive bounds, of every element for tuples.
+        choices: permitted strings.
+        length: required number of elements of a tuple, or a tuple of permitted ones.
+        read_only: whether a running node refuses to change it.
+    """
+    return dataclasses.field(default=default, metadata=dict(
+        doc=doc, unit=unit, low=low, high=high, choices=choices, length=length,
+        read_only=read_only))
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterInfo:
+    """What is known of one parameter; ``kind`` is float, int, bool, str or tuple of one."""
+
+    name: str
+    kind: object
+    element: type
+    is_tuple: bool
+    optional: bool
+    default: object
+    doc: str
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple | None
+    length: int | tuple | None
+    read_only: bool
+
+    def describe_bounds(self):
+        """The permitted values in words, for messages and tables."""
+        if self.choices:
+            return "one of " + ", ".join(map(str, self.choices))
+        parts = []
+        if self.low is not None and self.high is not None:
+            parts.append(f"{self.low:g} to {self.high:g}")
+        elif self.low is not None:
+            parts.append(f"at least {self.low:g}")
+        elif self.high is not None:
+            parts.append(f"at most {self.high:g}")
+        if self.length is not None:
+            lengths = self.length if isinstance(self.length, tuple) else (self.length,)
+            parts.append(" or ".join(map(str, lengths)) + " elements")
+        return ", ".join(parts)
+
+    def check(self, value, source=""):
+        """Return ``value`` in this parameter's type, or raise ParameterError."""
+        where = f" (from {source})" if source else ""
+
+        def refuse(why):
+            bounds = self.describe_bounds()
+            allowed = f"; allowed: {bounds}" if bounds else ""
+            unit = f" {self.unit}" if self.unit else ""
+            raise ParameterError(
+                f"parameter '{self.name}'{where}: {value!r} {why}{allowed}{unit}")
+
+        if value is None:
+            if self.optional:
+                return None
+            refuse("is not a value")
+        if not self.is_tuple:
+            return self._check_element(value, refuse)
+        if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
+            refuse(f"is not a list of {self.element.__name__}")
+        result = tuple(self._check_element(v, refuse) for v in value)
+        if self.length is not None:
+            lengths = self.length if isinstance(self.length, tuple) else (self.length,)
+            if len(result) not in lengths:
+                refuse(f"has {len(result)} elements")
+        return result
+
+    def _check_element(self, value, refuse):
+        if self.element is bool:
+            if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):
+                refuse("is not true or false")
+            return bool(value)
+        if self.element is str:
+            if not isinstance(value, str):
+                refuse("is not a string")
+            if self.choices and value not in self.choices:
+                refuse("is not permitted")
+            return value
+        if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
+            refuse(f"is not {'an integer' if self.element is int else 'a number'}")
+        number = float(value)
+        if math.isnan(number):
+            refuse("is not a number")
+        if self.element is int:
+            if number != int(number):
+                refuse("is not an integer")
+            number = int(value)
+        if (self.low is not None and number < self.low) or (
+                self.high is not None and number > self.high):
+            refuse("is out of bounds")
+        return number
+
+
+def _split_type(annotation):
+    """(element type, is tuple, optional) of a field's annotation."""
+    optional = False
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
+        arguments = [a for a in typing.get_args(annotation) if a is not type(None)]
+        optional = True
+        (annotation,) = arguments
+    if typing.get_origin(annotation) is tuple:
+        return typing.get_args(annotation)[0], True, optional
+    return annotation, False, optional
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """Base of all parameter dataclasses; validates every field when made.
+
+    In ROS names a double underscore of the field stands for a dot:
+    ``initial__mode`` is the parameter ``initial.mode``.
+    """
+
+    def __post_init__(self):
+        for info in self.infos():
+            field = info.name.replace(".", "__")
+            object.__setattr__(self, field, info.check(getattr(self, field)))
+
+    @classmethod
+    def infos(cls):
+        """A list of ParameterInfo, in order of declaration."""
+        hints = typing.get_type_hints(cls)
+        result = []
+        for field in dataclasses.fields(cls):
+            element, is_tuple, optional = _split_type(hints[field.name])
+            result.append(ParameterInfo(
+                name=field.name.replace("__", "."), kind=hints[field.name], element=element,
+                is_tuple=is_tuple, optional=optional, default=field.default, **field.metadata))
+        return result
+
+    @classmethod
+    def from_mapping(cls, values, source="", ignore=()):
+        """Make parameters from a mapping, nested or with dotted names.
+
+        Args:
+            values: mapping of names to values.
+            source: where they come from, for error messages.
+            ignore: names (or prefixes ending in a dot) that belong to somebody else.
+
+        Raises:
+            ParameterError: unknown name, wrong type, value out of bounds.
+        """
+        flat = flatten(values)
+        known = {info.name: info for info in cls.infos()}
+        accepted = {}
+        for name, value in flat.items():
+            if name in known:
+                accepted[name.replace(".", "__")] = known[name].check(value, source)
+            elif not any(name == i or (i.endswith(".") and name.startswith(i)) for i in ignore):
+                raise ParameterError(
+                    f"unknown parameter '{name}'" + (f" (from {source})" if source else "")
+                    + "; known: " + ", ".join(sorted(known)))
+        return cls(**accepted)
+
+    def to_mapping(self):
+        """Dotted names and values, without what is unset."""
+        pairs = ((info.name, getattr(self, info.name.replace(".", "__")))
+                 for info in self.infos())
+        return {name: list(value) if isinstance(value, tuple) else value
+                for name, value in pairs if value is not None}
+
+    def replace(self, **changes):
+        """A validated copy with changes."""
+        return dataclasses.replace(self, **changes)
+
+
+def flatten(values, prefix=""):
+    """Dotted names of a nested mapping: ``{'a': {'b': 1}}`` becomes ``{'a.b': 1}``."""
+    flat = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, name + "."))
+        else:
+            flat[name] = value
+    return flat
+
+
+def markdown_table(cls):
+    """The parameters of ``cls`` as the rows of a Markdown table."""
+    lines = ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+    for info in cls.infos():
+        default = "unset" if info.default is None else info.default
+        if isinstance(default, tuple):
+            default = list(default)
+        lines.append(f"| `{info.name}` | {default} | {info.unit} | "
+                     f"{info.describe_bounds()} | {info.doc} |")
+    return "\n".join(lines)

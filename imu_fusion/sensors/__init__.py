@@ -1,0 +1,1 @@
+"""Noise presets, calibration and saturation recovery. No ROS, no files."""

@@ -1,0 +1,54 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "imu_fusion"
+
+
+def tree(source, target, patterns):
+    """data_files entries that install the files of ``source`` below share/<package>/``target``."""
+    files = sorted(path for pattern in patterns for path in glob(f"{source}/{pattern}"))
+    return [(f"share/{package_name}/{target}", files)] if files else []
+
+
+# PyPI builds of ROS 2 Jazzy, for machines without an apt ROS. Never mix the two.
+ros = ["ros-jazzy-rclpy>=7.1,<8", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"]
+report = ["plotly>=5.20"]
+peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
+test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report]
+
+nodes = ["replayer", "recorder", "orientation_estimator"]
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    description="Orientation, acceleration fields and trajectories from inertial sensors",
+    long_description="ROS 2 Jazzy package for live and replayed inertial sensor fusion.",
+    author="imu_fusion maintainers",
+    maintainer="imu_fusion maintainers",
+    maintainer_email="maintainers@imu-fusion.example.org",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=find_packages(include=["imu_fusion", "imu_fusion.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        *tree("launch", "launch", ["*.launch.py"]),
+        *tree("config", "config", ["*.yaml"]),
+        *tree("config/surfaces", "config/surfaces", ["*.yaml", "*.asc"]),
+        *tree("bags", "bags", ["README.md"]),
+        *[entry for folder in sorted(glob("bags/*/"))
+          for entry in tree(folder.rstrip("/"), folder.rstrip("/"), ["*"])],
+    ],
+    install_requires=[
+        "numpy>=1.26", "scipy>=1.11", "numba>=0.60", "PyYAML>=6",
+        "rosbags>=0.10", "mcap>=1.1", "zstandard", "lz4",
+        "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
+    ],
+    extras_require={"ros": ros, "report": report, "peers": peers, "test": test},
+    entry_points={"console_scripts": [
+        "imu_fusion = imu_fusion.cli:main",
+        *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
+    ]},
+    zip_safe=False,
+)
