@@ -61,6 +61,12 @@ class Log:
                    if getattr(self, name) is not None}
         return dataclasses.replace(self, stamp=self.stamp[index], **changes)
 
+    def flat(self):
+        """All columns side by side: (n, k) float64, without the stamps."""
+        columns = [getattr(self, name).reshape(len(self), int(np.prod(shape)))
+                   for name, shape in self._columns() if getattr(self, name) is not None]
+        return np.concatenate([np.empty((len(self), 0)), *columns], axis=1)
+
     def between(self, start, stop):
         """The rows with ``start <= stamp < stop`` (int nanoseconds)."""
         return self[(self.stamp >= start) & (self.stamp < stop)]
