@@ -70,7 +70,7 @@ overwrite_option = click.option("--overwrite", is_flag=True,
 def run(node, arguments):
     """Start NODE as `ros2 run imu_fusion NODE` would; ARGUMENTS go to it (--ros-args ...)."""
     main_function = importlib.import_module(f"imu_fusion.nodes.{node}").main
-    sys.exit(main_function([node, *arguments]))
+    sys.exit(main_function(list(arguments)))
 
 
 @cli.command()
@@ -172,8 +172,7 @@ def convert(source, out, topics, remap, overwrite):
 def play(bag, arguments, **options):
     """Play BAG through the replayer node; further ARGUMENTS go to the node."""
     from imu_fusion.nodes import replayer
-    sys.exit(replayer.main(["replayer", *_ros_args(bag=str(Path(bag).absolute()), **options),
-                            *arguments]))
+    sys.exit(replayer.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments]))
 
 
 @cli.command(context_settings=PASS_ON)
@@ -185,8 +184,7 @@ def play(bag, arguments, **options):
 def record(out, topics, **options):
     """Record TOPICS (all, if none are given) into the rosbag2 MCAP directory OUT."""
     from imu_fusion.nodes import recorder
-    sys.exit(recorder.main(["recorder", *_ros_args(out=str(Path(out).absolute()), topics=topics,
-                                                   **options)]))
+    sys.exit(recorder.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options)))
 
 
 def _ros_args(**values):
