@@ -11,8 +11,8 @@ estimators keep it about the axes of the sensor.
 import numpy as np
 
 from imu_fusion.errors import TopicError
-from imu_fusion.geometry.rotation import quat_to_matrix
-from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST
+from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
+from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 
 UNKNOWN = np.zeros((3, 3))
@@ -81,6 +81,31 @@ def orientation_message(row, frame_id):
                        rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
 
 
+def rpy_message(row, frame_id):
+    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of one row."""
+    return VECTOR3.encode(row["stamp"], frame_id, quat_to_rpy(row["quat_world_imu"]))
+
+
+def bool_message(value):
+    """CDR bytes of a std_msgs/Bool."""
+    return b"\x00\x01\x00\x00\x01" if value else b"\x00\x01\x00\x00\x00"
+
+
+def imu_values(values):
+    """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
+    result = np.concatenate([values[..., IMU["angular_velocity"]],
+                             values[..., IMU["linear_acceleration"]]], axis=-1)
+    for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_acceleration")):
+        absent = values[..., IMU[field + "_covariance"].start] == -1.0
+        result[..., part][absent] = np.nan
+    return result
+
+
+def mag_values(values):
+    """Field (..., 3) of decoded sensor_msgs/MagneticField values."""
+    return values[..., MAG["magnetic_field"]]
+
+
 def _frame(frames, default):
     return frames[0] if frames else default
 
@@ -92,14 +117,14 @@ def _covariance(values, field):
 def imu_log(messages):
     """ImuLog of a list of CDR sensor_msgs/Imu, in the order given."""
     stamp, frames, values = IMU.decode_many(messages)
-    return ImuLog(stamp, values[:, IMU["angular_velocity"]], values[:, IMU["linear_acceleration"]],
-                  _frame(frames, "imu_link"))
+    samples = imu_values(values)
+    return ImuLog(stamp, samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
 
 
 def mag_log(messages):
     """MagLog of a list of CDR sensor_msgs/MagneticField."""
     stamp, frames, values = MAG.decode_many(messages)
-    return MagLog(stamp, values[:, MAG["magnetic_field"]], _frame(frames, "imu_link"))
+    return MagLog(stamp, mag_values(values), _frame(frames, "imu_link"))
 
 
 def fix_log(messages):
