@@ -23,6 +23,7 @@ from imu_fusion.samples.guard import guard_log
 class Stage:
     """One estimator of the batch path.
 
+    ``findings(logs)`` lists in words what looks wrong with whole logs as recorded.
     ``run(params, logs)`` yields (topic, stamp, cdr) of the ``outputs``; ``logs`` maps a
     topic to (log, epochs) of the samples fit for use, None for an optional topic
     that the recording lacks.
@@ -34,6 +35,7 @@ class Stage:
     optional: dict
     outputs: dict
     run: Callable
+    findings: Callable
 
 
 @dataclass
@@ -55,7 +57,8 @@ def stages():
               required={streams.IMU_TOPIC: IMU.msgtype},
               optional={streams.MAG_TOPIC: MAG.msgtype},
               outputs=streams.OrientationStream.outputs,
-              run=streams.orientation_batch),
+              run=streams.orientation_batch,
+              findings=streams.orientation_findings),
     )}
 
 
@@ -73,7 +76,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         progress: called with a line of text as things happen.
 
     Returns:
-        (list of StageReport, list of warnings about the recording)
+        (list of StageReport, list of what looks wrong with the recording)
 
     Raises:
         ImuFusionError: recording, parameters or topics are not usable.
@@ -110,14 +113,15 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         warnings = list(reader.warnings)
     with BagWriter(out, overwrite=overwrite) as writer:
         for stage, report, names in chosen:
-            progress(f"{stage.node}: {', '.join(f'{len(logs[n][0])} x {n}' for n in names.values())}")
+            progress(f"{stage.node}: {', '.join(f'{len(logs[n][0])} {n}' for n in names.values())}")
             inputs = {}
             for topic, name in names.items():
-                log, epochs, guard = logs[name]
+                _, log, epochs, guard = logs[name]
                 inputs[topic] = (log, epochs)
                 report.used[topic] = len(log)
                 if guard.refused():
                     report.refused[topic] = guard.refused()
+            warnings += stage.findings({topic: logs[name][0] for topic, name in names.items()})
             for topic, stamp, cdr in stage.run(report.params, inputs):
                 writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
                 report.written[topic] += 1
@@ -125,12 +129,12 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
 
 
 def _read(reader, names):
-    """dict of topic to (log, epochs, guard): what is fit for use, in bag order."""
+    """dict of topic to (log as recorded, log fit for use, its epochs, Guard), in bag order."""
     raw = {name: [] for name in names}
     for topic, _, _, cdr in reader.messages(names):
         raw[topic].append(cdr)
-    return {name: guard_log(LOGS[reader.topics[name].msgtype](messages))
-            for name, messages in raw.items()}
+    logs = {name: LOGS[reader.topics[name].msgtype](messages) for name, messages in raw.items()}
+    return {name: (log, *guard_log(log)) for name, log in logs.items()}
 
 
 def explain_missing(reader, wanted):

@@ -14,7 +14,7 @@ from imu_fusion.estimation.orientation_state import FLAG_STILL
 from imu_fusion.messages.convert import (bool_message, imu_values, mag_values,
                                          orientation_message, rpy_message)
 from imu_fusion.messages.layouts import BOOL_TYPE, IMU, MAG, VECTOR3
-from imu_fusion.samples import MagLog
+from imu_fusion.samples import ImuLog, MagLog, checks
 from imu_fusion.samples.merge import RESTART, SampleStream
 
 IMU_TOPIC = "imu/data_raw"
@@ -22,6 +22,8 @@ MAG_TOPIC = "imu/mag"
 ORIENTATION_TOPIC = "imu/data"
 RPY_TOPIC = "imu/rpy/filtered"
 STEADY_TOPIC = "imu/steady_state"
+
+_LOOK_AT = 500  # samples of each topic whose units and axes are looked at, live
 
 
 def _orientation_messages(rows, frame_id, steady):
@@ -66,6 +68,7 @@ class OrientationStream:
         self._queue.clear()
         self._steady = None
         self.frame_ids = {}
+        self._first = {topic: [] for topic in self.inputs}
 
     def push(self, topic, cdr):
         """Take the bytes of one message; what may happen now is queued for :meth:`step`."""
@@ -78,7 +81,10 @@ class OrientationStream:
         if topic not in self.frame_ids:
             self.frame_ids[topic] = frame_id
             self._check_frames()
-        self._queue.extend(self.stream.add(topic, stamp, self._values[topic](values)))
+        values = self._values[topic](values)
+        if len(self._first[topic]) < _LOOK_AT:
+            self._look_at(topic, stamp, values)
+        self._queue.extend(self.stream.add(topic, stamp, values))
 
     def step(self):
         """Process one queued event; False if there is none."""
@@ -112,6 +118,18 @@ class OrientationStream:
                 self._steady = cdr[-1] == 1
             self._emit(topic, stamp, cdr)
 
+    def _look_at(self, topic, stamp, values):
+        first = self._first[topic]
+        first.append((stamp, values))
+        if len(first) < _LOOK_AT:
+            return
+        logs = {t: _raw_log(t, rows) for t, rows in self._first.items()}
+        findings = _unit_findings(topic, logs[topic])
+        if all(len(log) >= _LOOK_AT for log in logs.values()):
+            findings += checks.check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+        for finding in findings:
+            self._warn(finding.text)
+
     def _refused(self, topic, stamp, verdict):
         count = self.stream.guards[topic].counts[verdict]
         if count in (1, 10, 100) or count % 1000 == 0:
@@ -123,6 +141,33 @@ class OrientationStream:
         if len(set(frames.values())) > 1:
             self._warn(f"{MAG_TOPIC} is in frame '{frames[MAG_TOPIC]}' and {IMU_TOPIC} in "
                        f"'{frames[IMU_TOPIC]}': their axes are taken as parallel")
+
+
+def _raw_log(topic, rows):
+    stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+    values = np.array([values for _, values in rows])
+    if topic == IMU_TOPIC:
+        return ImuLog(stamps, values[..., :3], values[..., 3:])
+    return MagLog(stamps, values)
+
+
+def _unit_findings(topic, log):
+    if topic == IMU_TOPIC:
+        return checks.check_acceleration(log.acc, log.stamp, topic)
+    return checks.check_field(log.mag, topic)
+
+
+def orientation_findings(logs):
+    """What looks wrong with whole logs: texts.
+
+    Args:
+        logs: dict of input topic to log, as recorded.
+    """
+    findings = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
+    if MAG_TOPIC in logs:
+        findings += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
+        findings += checks.check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+    return [finding.text for finding in findings]
 
 
 def orientation_batch(params, logs):
