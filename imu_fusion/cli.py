@@ -118,11 +118,14 @@ def info(bag, target):
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
         for warning in reader.warnings:
             click.echo(f"warning: {warning}")
-        table = Table("topic", "type", "messages", "rate Hz", "longest gap s", "notes")
-        for row in inspect_topics(reader):
-            table.add_row(row.topic, row.msgtype, str(row.count), _number(row.rate, "{:.2f}"),
-                          _number(row.longest_gap, "{:.3f}"), "; ".join(row.notes))
-        console.print(table)
+        rows = inspect_topics(reader)
+        click.echo(f"{'topic':<32} {'type':<28} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")
+        for row in rows:
+            click.echo(f"{row.topic:<32} {row.msgtype.replace('/msg/', '/'):<28} {row.count:>9} "
+                       f"{_number(row.rate, '{:.2f}'):>9} {_number(row.longest_gap, '{:.3f}'):>9}")
+        for row in rows:
+            for note in row.notes:
+                click.echo(f"  {row.topic}: {note}")
     if target:
         counts = repair(bag, target)
         click.echo(f"written: {target} with {sum(counts.values())} messages")
@@ -209,8 +212,8 @@ def _ros_args(**values):
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
 def report(bag, estimates, out):
     """Write an HTML report of BAG and its estimates, with a reference if BAG has one."""
-    from imu_fusion.report.orientation import report_recording
-    report_recording(bag, estimates or bag, out)
+    from imu_fusion.report.recording import write_orientation_report
+    write_orientation_report(bag, estimates or bag, out)
     click.echo(f"written: {out}")
 
 

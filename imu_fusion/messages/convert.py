@@ -93,6 +93,11 @@ def bool_message(value):
     return b"\x00\x01\x00\x00\x01" if value else b"\x00\x01\x00\x00\x00"
 
 
+def bool_value(cdr):
+    """The value of a CDR std_msgs/Bool."""
+    return cdr[4] == 1
+
+
 def imu_values(values):
     """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
     result = np.concatenate([values[..., IMU["angular_velocity"]],
