@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 from imu_fusion.nodes import NODES
+from imu_fusion.nodes.base import Node
 from imu_fusion.parameters import markdown_table
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -19,7 +20,9 @@ def parameters():
     """One table per node, from the dataclasses that it declares."""
     parts = []
     for name in NODES:
-        node = importlib.import_module(f"imu_fusion.nodes.{name}").NODE
+        module = importlib.import_module(f"imu_fusion.nodes.{name}")
+        (node,) = [v for v in vars(module).values() if isinstance(v, type)
+                   and issubclass(v, Node) and v.__module__ == module.__name__]
         parts.append(f"<details><summary>Parameters of <code>{name}</code></summary>\n")
         parts += [markdown_table(cls) + "\n" for cls in node.PARAMETERS]
         parts.append("</details>\n")
