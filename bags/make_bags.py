@@ -208,7 +208,7 @@ def write_recording(recording, source, out):
     directory = out / recording.name
     with BagWriter(directory, overwrite=True, chunk_size=1024 * 1024) as writer:
         for stamp, _, topic, msgtype, cdr in rows:
-            writer.write(topic, msgtype, cdr, int(stamp))
+            writer.write("/" + topic, msgtype, cdr, int(stamp))
     return directory
 
 

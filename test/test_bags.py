@@ -107,7 +107,7 @@ def test_units_are_si(logs, name):
     gyr = imu.gyr[quiet * window:(quiet + 1) * window]
     assert np.linalg.norm(gyr.mean(axis=0)) < np.radians(3)
     assert np.abs(imu.gyr).max() < 40  # rad/s; in degrees it would exceed this
-    if "imu/mag" in MANIFEST[name]["topics"]:
+    if "/imu/mag" in MANIFEST[name]["topics"]:
         field = np.linalg.norm(logs(name, "imu/mag").mag, axis=1)
         assert 20e-6 < np.median(field) < 70e-6
 
@@ -133,7 +133,7 @@ def test_broad_reference_carries_gravity_up_and_the_field_north_and_down(logs, n
 def test_movement_mask_marks_the_turning(logs, name):
     imu = logs(name, "imu/data_raw")
     with open_bag(BAGS / name) as reader:
-        changes = [(t, cdr[4] != 0) for _, _, t, cdr in reader.messages(["reference/moving"])]
+        changes = [(t, cdr[4] != 0) for _, _, t, cdr in reader.messages(["/reference/moving"])]
     stamp, value = zip(*changes)
     assert stamp[0] == imu.stamp[0]
     moving = moving_at(imu.stamp, stamp, value)

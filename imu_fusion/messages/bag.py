@@ -354,6 +354,9 @@ class BagWriter:
             qos: list of :func:`qos_profile` as offered by its publishers.
             definition: (ros2msg text, RIHS01 hash) of a type that Jazzy does not have.
         """
+        if not topic.startswith("/"):
+            raise BagError(f"{self.directory}: topic '{topic}' must be absolute in a recording: "
+                           f"'/{topic}'")
         qos = [qos_profile()] if qos is None else qos
         if definition is None:
             if msgtype not in self._typestore.fielddefs:

@@ -9,11 +9,13 @@ estimators keep it about the axes of the sensor.
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
-from imu_fusion.geometry.rotation import quat_to_matrix
-from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST
-from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog
+from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
+from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3
+from imu_fusion.samples import (AttitudeLog, FixLog, ImuLog, MagLog, PoseLog,
+                                VelocityLog)
 
 UNKNOWN = np.zeros((3, 3))
 ABSENT = np.zeros((3, 3))
@@ -81,6 +83,36 @@ def orientation_message(row, frame_id):
                        rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
 
 
+def rpy_message(row, frame_id):
+    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of one row."""
+    return VECTOR3.encode(row["stamp"], frame_id, quat_to_rpy(row["quat_world_imu"]))
+
+
+def bool_message(value):
+    """CDR bytes of a std_msgs/Bool."""
+    return b"\x00\x01\x00\x00\x01" if value else b"\x00\x01\x00\x00\x00"
+
+
+def bool_value(cdr):
+    """The value of a CDR std_msgs/Bool."""
+    return cdr[4] == 1
+
+
+def imu_values(values):
+    """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
+    result = np.concatenate([values[..., IMU["angular_velocity"]],
+                             values[..., IMU["linear_acceleration"]]], axis=-1)
+    for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_acceleration")):
+        absent = values[..., IMU[field + "_covariance"].start] == -1.0
+        result[..., part][absent] = np.nan
+    return result
+
+
+def mag_values(values):
+    """Field (..., 3) of decoded sensor_msgs/MagneticField values."""
+    return values[..., MAG["magnetic_field"]]
+
+
 def _frame(frames, default):
     return frames[0] if frames else default
 
@@ -92,14 +124,14 @@ def _covariance(values, field):
 def imu_log(messages):
     """ImuLog of a list of CDR sensor_msgs/Imu, in the order given."""
     stamp, frames, values = IMU.decode_many(messages)
-    return ImuLog(stamp, values[:, IMU["angular_velocity"]], values[:, IMU["linear_acceleration"]],
-                  _frame(frames, "imu_link"))
+    samples = imu_values(values)
+    return ImuLog(stamp, samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
 
 
 def mag_log(messages):
     """MagLog of a list of CDR sensor_msgs/MagneticField."""
     stamp, frames, values = MAG.decode_many(messages)
-    return MagLog(stamp, values[:, MAG["magnetic_field"]], _frame(frames, "imu_link"))
+    return MagLog(stamp, mag_values(values), _frame(frames, "imu_link"))
 
 
 def fix_log(messages):
@@ -124,23 +156,44 @@ def pose_log(messages):
                    _frame(frames, "world"))
 
 
+def attitude_log(messages):
+    """AttitudeLog of a list of CDR sensor_msgs/Imu with orientation, such as imu/data.
+
+    Raises:
+        TopicError: the messages say that they carry no orientation.
+    """
+    stamp, frames, values = IMU.decode_many(messages)
+    cov_world = _covariance(values, IMU["orientation_covariance"])
+    if (cov_world[:, 0, 0] == -1.0).any():
+        raise TopicError("these sensor_msgs/Imu carry no orientation (covariance[0] is -1): they "
+                         "are raw data, not estimates")
+    quat = values[:, IMU["orientation"]]
+    rotation = Rotation.from_quat(quat).as_matrix() if len(quat) else np.empty((0, 3, 3))
+    samples = imu_values(values)
+    return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,
+                       samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
+
+
 LOGS = {IMU.msgtype: imu_log, MAG.msgtype: mag_log, FIX.msgtype: fix_log,
         TWIST.msgtype: velocity_log, POSE.msgtype: pose_log}
 
 
-def read_log(reader, topic):
+def read_log(reader, topic, log_of=None):
     """The log of one topic of an open recording.
 
     Args:
         reader: what :func:`imu_fusion.messages.bag.open_bag` returned.
         topic: name, with or without leading slash.
+        log_of: function of a list of messages, if not the one of the type in LOGS
+            (such as :func:`attitude_log`).
 
     Raises:
         TopicError: no such topic, or a type that has no log.
         MessageError: bytes that do not fit the type.
     """
     info = reader.require(topic)
-    if info.msgtype not in LOGS:
+    log_of = log_of or LOGS.get(info.msgtype)
+    if log_of is None:
         raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
                          f"logs exist for {', '.join(sorted(LOGS))}")
-    return LOGS[info.msgtype]([cdr for *_, cdr in reader.messages([info.name])])
+    return log_of([cdr for *_, cdr in reader.messages([info.name])])

@@ -59,6 +59,12 @@ def reliable_qos(depth=DEPTH, durability=DurabilityPolicy.VOLATILE):
                       reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
+def sensor_qos():
+    """The QoS of live inputs: best effort takes any publisher; deep, for bursts."""
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH,
+                      reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
 # A source keeps one event: who comes late hears of the present session, not of past ones.
 # None is overwritten unheard, since each but the last is answered before the next.
 _STATUS_OFFERED = reliable_qos(1, DurabilityPolicy.TRANSIENT_LOCAL)

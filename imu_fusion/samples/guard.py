@@ -20,7 +20,7 @@ class Verdict(enum.Enum):
     """Why a sample was refused; OK if it was not."""
 
     OK = "ok"
-    NOT_FINITE = "not finite (NaN or infinite)"
+    NOT_FINITE = "not finite (NaN, infinite or absent)"
     DUPLICATE = "repeated stamp"
     BACKWARDS = "stamp older than the one before"
 

@@ -232,3 +232,5 @@ def test_writer_refuses_what_is_in_its_way(tmp_path):
             writer.write("/a", MAG.msgtype, imu(0), START)
         with pytest.raises(BagError, match="definition"):
             writer.write("/b", "nobody_msgs/msg/Thing", b"", START)
+        with pytest.raises(BagError, match="absolute.*'/c'"):
+            writer.write("c", IMU.msgtype, imu(0), START)
