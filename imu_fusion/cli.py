@@ -119,9 +119,9 @@ def info(bag, target):
         for warning in reader.warnings:
             click.echo(f"warning: {warning}")
         rows = inspect_topics(reader)
-        click.echo(f"{'topic':<32} {'type':<28} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")
+        click.echo(f"{'topic':<32} {'type':<44} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")
         for row in rows:
-            click.echo(f"{row.topic:<32} {row.msgtype.replace('/msg/', '/'):<28} {row.count:>9} "
+            click.echo(f"{row.topic:<32} {row.msgtype.replace('/msg/', '/'):<44} {row.count:>9} "
                        f"{_number(row.rate, '{:.2f}'):>9} {_number(row.longest_gap, '{:.3f}'):>9}")
         for row in rows:
             for note in row.notes:
@@ -167,11 +167,12 @@ def convert(source, out, topics, remap, overwrite):
 @click.option("--rate", type=float, default=1.0, show_default=True,
               help="Speed; 0: as fast as our nodes take it, nothing lost.")
 @click.option("--loop", is_flag=True, help="Start over at the end.")
-@click.option("--clock", is_flag=True, help="Publish /clock.")
+@click.option("--clock", type=float, default=0.0, metavar="HZ", help="Publish /clock; 0: do not.")
 @click.option("--start-offset", type=float, default=0.0, help="Seconds to leave out at the start.")
 @click.option("--duration", type=float, help="Seconds to play.")
 @click.option("--topic", "topics", multiple=True, help="Play only this topic. Repeatable.")
-@click.option("--wait-for", multiple=True, metavar="NODE", help="Wait for a node. Repeatable.")
+@click.option("--wait-for", "wait_for_nodes", multiple=True, metavar="NODE",
+              help="Wait for one of our nodes. Repeatable.")
 def play(bag, arguments, **options):
     """Play BAG through the replayer node; further ARGUMENTS go to the node."""
     from imu_fusion.nodes import replayer

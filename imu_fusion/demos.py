@@ -1,12 +1,14 @@
 """``imu_fusion demo``: the main job on a real recording, through real ROS 2 nodes."""
 
-import importlib.util
+import os
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
+import imu_fusion
 from imu_fusion.errors import BagError, ParameterError
 from imu_fusion.estimation.orientation_error import (moving_at, orientation_errors, shares_within,
                                                      statistics)
@@ -22,13 +24,9 @@ def bags_directory():
     Raises:
         BagError: neither is there.
     """
-    package = Path(importlib.util.find_spec("imu_fusion").origin).parent
-    candidates = [package.parent / "bags"]
-    try:
-        from ament_index_python.packages import get_package_share_directory
-        candidates.append(Path(get_package_share_directory("imu_fusion")) / "bags")
-    except (ImportError, LookupError):
-        pass  # no ROS, or not installed with ament
+    prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
+    candidates = [Path(imu_fusion.__file__).parent.parent / "bags"]
+    candidates += [Path(prefix) / "share" / "imu_fusion" / "bags" for prefix in prefixes if prefix]
     for candidate in candidates:
         if candidate.is_dir():
             return candidate
