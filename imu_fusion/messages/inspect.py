@@ -25,14 +25,15 @@ class Range:
 
 @dataclass(frozen=True)
 class TopicReport:
-    """One topic: ``timing`` of its header stamps (log times, if it has no header), ``ranges``
-    of what it measures, ``findings`` about it."""
+    """One topic: ``timing`` of its header stamps (log times, if it is not ``stamped`` because
+    its messages have no header), ``ranges`` of what it measures, ``findings`` about it."""
 
     topic: str
     msgtype: str
     timing: checks.Timing
     ranges: tuple
     findings: tuple
+    stamped: bool = True
 
     @property
     def count(self):
@@ -41,13 +42,13 @@ class TopicReport:
 
     @property
     def rate(self):
-        """Mean rate in Hz, None with fewer than two stamps."""
-        return None if np.isnan(self.timing.rate_hz) else self.timing.rate_hz
+        """Mean rate in Hz, None with fewer than two stamps or without a header."""
+        return None if not self.stamped or np.isnan(self.timing.rate_hz) else self.timing.rate_hz
 
     @property
     def longest_gap(self):
-        """Longest interval in s, None with fewer than two stamps."""
-        return None if np.isnan(self.timing.longest_gap_s) else self.timing.longest_gap_s
+        """Longest interval in s, None with fewer than two stamps or without a header."""
+        return None if not self.stamped or np.isnan(self.timing.longest_gap_s) else self.timing.longest_gap_s
 
     @property
     def notes(self):
@@ -75,8 +76,7 @@ def inspect_topics(reader):
                 continue
             report = inspect_log(name, info.msgtype, logs[name])
         else:
-            stamp, findings = _stamps(reader, name, info)
-            report = TopicReport(name, info.msgtype, checks.timing(stamp), (), tuple(findings))
+            report = _inspect_stamps(reader, name, info)
         reports.append(report)
     return [_with_axes(report, logs) for report in reports]
 
@@ -119,20 +119,20 @@ def _with_axes(report, logs):
     return TopicReport(report.topic, report.msgtype, report.timing, report.ranges, findings)
 
 
-def _stamps(reader, name, info):
-    """(stamps (n,) int64, findings) of a topic whose contents are not looked at."""
+def _inspect_stamps(reader, name, info):
+    """TopicReport of a topic whose contents are not looked at."""
     fields = reader.typestore.fielddefs.get(info.msgtype, ((), ()))[1]
-    has_header = bool(fields) and fields[0][1][1] == _HEADER
+    stamped = bool(fields) and fields[0][1][1] == _HEADER
     stamps = []
     for _, _, log_time, cdr in reader.messages([name]):
-        if has_header and len(cdr) >= 12:
+        if stamped and len(cdr) >= 12:
             sec, nanosec = struct.unpack_from("<iI" if cdr[1] else ">iI", cdr, 4)
             stamps.append(sec * NANOSECONDS + nanosec)
         else:
             stamps.append(log_time)
-    stamps = np.array(stamps, dtype=np.int64)
     # Without a header, messages may be sent at any time: gaps mean nothing.
-    return stamps, checks.check_stamps(stamps, name) if has_header else []
+    findings = checks.check_stamps(stamps, name) if stamped else []
+    return TopicReport(name, info.msgtype, checks.timing(stamps), (), tuple(findings), stamped)
 
 
 def _norm(vectors):

@@ -18,11 +18,11 @@ AXES = {"x": "#D55E00", "y": "#009E73", "z": "#0072B2"}
 ESTIMATE = "#0072B2"
 REFERENCE = "#1f2933"
 BAND = "#56B4E9"
+LIGHT = "#a9cfe8"
 HIGHLIGHT = "#D55E00"
 SECONDARY = "#CC79A7"
 NEUTRAL = "#7b8794"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7b8794")
-_PANEL_HEIGHT = 205
 _INK, _GRID = "#39444f", "#e8ecf1"
 
 
@@ -58,7 +58,7 @@ class Panel:
     label: str
     items: tuple
     log: bool = False
-    floor: float | None = None
+    from_zero: bool = False
 
 
 def plain(text):
@@ -66,30 +66,33 @@ def plain(text):
     return html.escape(str(text), quote=False)
 
 
-def time_figure(panels, shaded=(), shaded_name=""):
+def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
     """Panels below each other over one time axis in seconds.
 
     Args:
         panels: list of Panel.
         shaded: list of (start, end) s to be marked in every panel.
         shaded_name: what they mean, for the legend.
+        panel_height: pixels of one panel.
     """
     figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True,
-                           vertical_spacing=0.14 / max(len(panels), 3))
+                           vertical_spacing=0.12 / max(len(panels), 3))
     named = set()
     for row, panel in enumerate(panels, start=1):
         for item in panel.items:
             for trace in _traces(item, named):
                 figure.add_trace(trace, row=row, col=1)
-        figure.update_yaxes(title_text=panel.label, row=row, col=1,
-                            type="log" if panel.log else "linear")
-        if panel.floor is not None:
-            figure.update_yaxes(rangemode="tozero", row=row, col=1)
+        figure.update_yaxes(type="log" if panel.log else "linear",
+                            rangemode="tozero" if panel.from_zero else "normal", row=row, col=1)
+        # Axis titles would stand at a distance that depends on their tick labels.
+        figure.add_annotation(text=panel.label, textangle=-90, showarrow=False, xref="paper", x=0,
+                              xshift=-62, yref=f"y{row if row > 1 else ''} domain", y=0.5,
+                              xanchor="center", yanchor="middle", font=dict(size=13))
     if len(shaded):
         _shade(figure, shaded, shaded_name)
     figure.update_layout(
-        height=int(95 + _PANEL_HEIGHT * len(panels)),
-        margin=dict(l=76, r=18, t=52, b=48), template="none", hovermode="x unified",
+        height=int(95 + panel_height * len(panels)),
+        margin=dict(l=84, r=18, t=52, b=48), template="none", hovermode="x unified",
         font=dict(family="system-ui, Segoe UI, Roboto, Helvetica, Arial, sans-serif", size=13,
                   color=_INK),
         legend=dict(orientation="h", x=0, xanchor="left", y=1, yref="container", yanchor="top",
@@ -98,9 +101,9 @@ def time_figure(panels, shaded=(), shaded_name=""):
     figure.update_xaxes(gridcolor=_GRID, zeroline=False, linecolor="#c5ced8", showline=True,
                         ticks="outside", tickcolor="#c5ced8", hoverformat=".3f", matches="x")
     figure.update_yaxes(gridcolor=_GRID, zerolinecolor="#c5ced8", zerolinewidth=1,
-                        linecolor="#c5ced8", showline=True, title_standoff=8,
-                        title_font=dict(size=13), exponentformat="power")
-    figure.update_xaxes(title_text="time since start in s", row=len(panels), col=1)
+                        linecolor="#c5ced8", showline=True, nticks=6)
+    figure.update_xaxes(title=dict(text="time since start in s", font=dict(size=13), standoff=6),
+                        row=len(panels), col=1)
     return figure
 
 
@@ -135,18 +138,18 @@ def _traces(item, named):
     time, values = decimate(item.time, item.values)
     return [go.Scatter(
         x=_compact(time), y=_compact(values), mode="markers" if item.markers else "lines",
-        line=dict(color=item.color, width=item.width, dash=item.dash),
+        line=dict(color=item.color, width=item.width, dash=item.dash, simplify=False),
         marker=dict(color=item.color, size=4), hovertemplate="%{y:.4g}", **common)]
 
 
 def _shade(figure, shaded, name):
     # One trace draws the legend entry, shapes the areas: shapes span the panels at any zoom.
     for start, end in shaded[:200]:
-        figure.add_vrect(x0=start, x1=end, fillcolor="#f0b429", opacity=0.10, line_width=0,
+        figure.add_vrect(x0=start, x1=end, fillcolor=NEUTRAL, opacity=0.11, line_width=0,
                          layer="below", row="all", col=1)
     figure.add_trace(go.Scatter(
         x=[None], y=[None], mode="markers", name=name,
-        marker=dict(symbol="square", size=12, color="rgba(240,180,41,0.35)")), row=1, col=1)
+        marker=dict(symbol="square", size=12, color="rgba(123,135,148,0.3)")), row=1, col=1)
 
 
 def _compact(values):

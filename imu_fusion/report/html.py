@@ -19,6 +19,10 @@ import imu_fusion
 from imu_fusion.errors import ImuFusionError
 
 
+# A number with its unit, a dash for none, or nothing: columns of these are set to the right.
+_NUMBER = re.compile(r"^([-+]?\d[\d.,]*(e[-+]?\d+)?( ?\S{1,4})?|–|)$")
+
+
 @dataclass(frozen=True)
 class Text:
     """A paragraph."""
@@ -66,26 +70,27 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells (text as it shall appear) below a header; numbers are set to the right."""
+    """Rows of cells (text as it shall appear) below a header; columns of numbers are set to the
+    right."""
 
     header: tuple
     rows: tuple
     caption: str = ""
 
     def render(self):
-        head = "".join(f"<th>{html.escape(str(cell))}</th>" for cell in self.header)
-        body = "".join("<tr>" + "".join(self._cell(cell) for cell in row) + "</tr>"
-                       for row in self.rows)
+        numeric = [all(_NUMBER.match(str(row[i])) for row in self.rows) for i in
+                   range(len(self.header))]
+        head = "".join(self._cell("th", *pair) for pair in zip(self.header, numeric))
+        body = "".join("<tr>" + "".join(self._cell("td", *pair) for pair in zip(row, numeric))
+                       + "</tr>" for row in self.rows)
         caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
         return (f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead>'
                 f"<tbody>{body}</tbody></table></div>")
 
     @staticmethod
-    def _cell(cell):
-        text = str(cell)
-        kind = ' class="number"' if re.match(r"^[-+–]?[\d.]+(e[-+]?\d+)?( ?[%°\w/²µ]{0,6})?$",
-                                             text) else ""
-        return f"<td{kind}>{html.escape(text)}</td>"
+    def _cell(tag, content, numeric):
+        kind = ' class="number"' if numeric else ""
+        return f"<{tag}{kind}>{html.escape(str(content))}</{tag}>"
 
 
 @dataclass(frozen=True)

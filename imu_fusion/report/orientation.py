@@ -112,11 +112,19 @@ def error_section(errors, origin, moving=None, reference_name="reference", shade
         time_figure(panels, shaded, _MOVING),
         "The error rotation in the axes of the world with the standard deviations that the "
         "estimator stated."))
-    angles = tuple(Line(name, time, np.degrees(getattr(errors, name)), color) for name, color in
-                   (("total", fig.NEUTRAL), ("heading", fig.HIGHLIGHT),
-                    ("inclination", fig.ESTIMATE)))
-    blocks.append(Figure(time_figure([Panel("error angle in °", angles, floor=0.0)], shaded,
-                                     _MOVING), "The error angles of the table."))
+    variance = errors.sd_world ** 2
+    panels = []
+    for name, columns in (("total", [0, 1, 2]), ("heading", [2]), ("inclination", [0, 1])):
+        expected = np.degrees(np.sqrt(variance[:, columns].sum(axis=1)))
+        panels.append(Panel(f"{name} in °", (
+            Band("3σ stated", time, 0 * expected, 3 * expected, opacity=0.18),
+            Band("1σ stated", time, 0 * expected, expected, opacity=0.38),
+            Line("error angle", time, np.degrees(getattr(errors, name)), fig.ESTIMATE)),
+            from_zero=True))
+    blocks.append(Figure(
+        time_figure(panels, shaded, _MOVING, panel_height=160),
+        "The error angles of the table; σ is the root of the sum of the variances involved, that "
+        "is the RMS that the estimator expected."))
     return Section("Error against the reference", tuple(blocks))
 
 
@@ -158,10 +166,10 @@ def field_section(stamp, mag_world, origin, shaded=()):
         low, median, high = np.percentile(values, [5, 50, 95])
         rows.append((name, unit, number(median, 2), number(low, 2), number(high, 2),
                      number(values.std(), 2)))
-    panels = [Panel("strength in µT", (Line("field", time, norm, fig.ESTIMATE),)),
-              Panel("inclination in °", (Line("field", time, dip, fig.ESTIMATE),)),
-              Panel("direction in °", (Line("field", time, fig.break_wraps(azimuth),
-                                            fig.ESTIMATE),))]
+    panels = [Panel(label, (Line("each sample", time, fig.break_wraps(values), fig.LIGHT, width=1),
+                            Line("mean over 1 s", *_mean(time, values), fig.ESTIMATE, width=1.8)))
+              for label, values in (("strength in µT", norm), ("inclination in °", dip),
+                                    ("direction in °", azimuth))]
     return Section("Magnetic field", (
         Table(("quantity", "unit", "median", "5 %", "95 %", "standard deviation"), tuple(rows)),
         Figure(time_figure(panels, shaded, _MOVING),
@@ -175,30 +183,23 @@ def motion_section(raw, corrected, origin, shaded=()):
 
     Args:
         raw: ImuLog as recorded, or None.
-        corrected: (stamp (n,), gyr (n, 3), acc (n, 3)) of the estimator, or None.
+        corrected: AttitudeLog of the estimator, or None; not both are None.
         origin: int ns, zero of the time axis.
     """
-    panels, caption = [], []
-    if raw is not None:
-        time = seconds(raw.stamp, origin)
-        gyr = np.degrees(raw.gyr)
-        panels.append(Panel("angular rate in °/s", _xyz(time, gyr)))
-        caption.append("As recorded.")
-    else:
-        time, gyr = seconds(corrected[0], origin), np.degrees(corrected[1])
-        panels.append(Panel("angular rate in °/s", _xyz(time, gyr)))
-        caption.append("As estimated.")
+    log = raw if raw is not None else corrected
+    time = seconds(log.stamp, origin)
+    panels = [Panel("angular rate in °/s", _xyz(time, np.degrees(log.gyr)))]
+    caption = ["As recorded." if raw is not None else "As estimated."]
     if raw is not None and corrected is not None:
-        shared, i, j = np.intersect1d(raw.stamp, corrected[0], return_indices=True)
+        shared, i, j = np.intersect1d(raw.stamp, corrected.stamp, return_indices=True)
         if len(shared):
             panels.append(Panel("correction in °/s", _xyz(
-                seconds(shared, origin), np.degrees(corrected[1][j] - raw.gyr[i]))))
+                seconds(shared, origin), np.degrees(corrected.gyr[j] - raw.gyr[i]))))
             caption.append("The correction is what the estimator added to the gyroscope: minus "
                            "its bias, plus what was recovered at its limit.")
-    acc = raw.acc if raw is not None else corrected[2]
     panels.append(Panel("specific force in m/s²", (
-        *_xyz(time, acc), Line("norm", time, np.linalg.norm(acc, axis=1), fig.REFERENCE,
-                               width=1.0))))
+        *_xyz(time, log.acc),
+        Line("norm", time, np.linalg.norm(log.acc, axis=1), fig.REFERENCE, width=1.0))))
     caption.append("The norm of the specific force is 9.81 m/s² at rest.")
     return Section("Angular rates and specific force", (
         Figure(time_figure(panels, shaded, _MOVING), " ".join(caption)),))
@@ -209,17 +210,27 @@ def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0):
     items = [Number("Duration", f"{duration_s:.1f} s"),
              Number("Imu", f"{number(imu_rate_hz, 1)} Hz", "mean rate")]
     if errors is not None:
-        where = _MOVING if moving is not None else "all samples"
+        where = _MOVING if moving is not None else "of all samples"
         for row in orientation_error.statistics(errors, moving):
             items.append(Number(f"{row.name.capitalize()} error", f"{number(row.rmse_deg, 2)}°",
-                                f"RMSE, {where}"))
+                                f"RMSE {where}"))
         shares = orientation_error.shares_within(errors, moving)
         for name, values in shares.items():
             if np.isfinite(values[0]):
                 items.append(Number(f"{name.capitalize()} within 3σ", f"{100 * values[2]:.1f} %",
-                                    "a Gaussian: 99.7 %"))
-    items.append(Number("Remarks", str(findings), "about stamps, units, ranges"))
+                                    "Gaussian: 99.7 %"))
+    items.append(Number("Remarks", str(findings), "on stamps, units, ranges"))
     return Numbers(tuple(items))
+
+
+def _mean(time, values):
+    """(time, mean) of the samples of every whole second."""
+    second = np.floor(time).astype(np.int64)
+    starts = np.flatnonzero(np.r_[True, second[1:] != second[:-1]]) if len(time) else []
+    if len(starts) == 0:
+        return time, values
+    count = np.diff(np.r_[starts, len(time)])
+    return (np.add.reduceat(time, starts) / count, np.add.reduceat(values, starts) / count)
 
 
 def _xyz(time, vectors):

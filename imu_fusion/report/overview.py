@@ -5,6 +5,7 @@ import numpy as np
 from imu_fusion.report.figures import SERIES, Line, Panel, time_figure
 from imu_fusion.report.html import Figure, Notes, Section, Table, Text
 from imu_fusion.samples import seconds
+from imu_fusion.samples.checks import GAP_FACTOR
 
 
 def overview_section(topics, stamps, origin):
@@ -18,17 +19,18 @@ def overview_section(topics, stamps, origin):
     rows = []
     for t in topics:
         times = t.timing
+        timed = (number(times.rate_hz, 2), number(times.jitter_s * 1e3, 3), times.gaps,
+                 number(times.longest_gap_s * 1e3, 1), times.repeated + times.backwards)
         rows.append((t.topic, t.msgtype.replace("/msg/", "/"), t.count,
-                     number(times.rate_hz, 2), number(times.jitter_s * 1e3, 3),
-                     times.gaps, number(times.longest_gap_s, 3),
-                     times.repeated + times.backwards,
-                     "; ".join(f"{r.quantity} {r.low:.4g} to {r.high:.4g} {r.unit}".strip()
+                     *(timed if t.stamped else ["–"] * len(timed)),
+                     ", ".join(f"{r.quantity} {r.low:.4g} to {r.high:.4g} {r.unit}".strip()
                                for r in t.ranges)))
     findings = [finding.text for t in topics for finding in t.findings]
-    blocks = [Table(("topic", "type", "messages", "rate Hz", "jitter ms", "gaps",
-                     "longest interval s", "stamps out of order", "range of values"), tuple(rows),
-                    "Times are those of the header stamps. Jitter: half the width of the central "
-                    "68 % of the intervals. Gaps: intervals above 1.8 times the usual one.")]
+    blocks = [Table(("topic", "type", "messages", "rate Hz", "jitter ms", "gaps", "longest ms",
+                     "out of order", "range of values"), tuple(rows),
+                    "By header stamps. Jitter: half the width of the central 68 % of the "
+                    f"intervals. Gaps: intervals above {GAP_FACTOR:g} times the usual one; the "
+                    "longest interval stands beside them.")]
     blocks.append(Notes(tuple(findings)) if findings
                   else Text("Nothing looks wrong: stamps increase, units and magnitudes fit, no "
                             "axis stands at a limit."))

@@ -50,7 +50,6 @@ def write_orientation_report(bag, estimates, path):
         estimate = None
         if _has(reader, ESTIMATES, IMU.msgtype):
             estimate = read_log(reader, ESTIMATES, attitude_log)
-            corrected = read_log(reader, ESTIMATES)
     if not topics:
         raise TopicError(f"{bag}: no topics to report about")
 
@@ -86,8 +85,7 @@ def write_orientation_report(bag, estimates, path):
         sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
     if raw is not None or estimate is not None:
         sections.append(motion_section(
-            raw, None if estimate is None else (corrected.stamp, corrected.gyr, corrected.acc),
-            origin, shaded))
+            raw, estimate, origin, shaded))
     date = datetime.datetime.fromtimestamp(start * 1e-9, datetime.timezone.utc)
     write_report(path, f"{Path(bag).resolve().name}", sections,
                  f"{Path(bag)}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
