@@ -5,7 +5,7 @@ import pytest
 
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.geometry.geodesy import LocalFrame, hill_axes
-from imu_fusion.geometry.gravity import normal_gravity
+from imu_fusion.geometry.gravity import gravity_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import (decimal_year, declination,
                                                 magnetic_field_world)
 
@@ -91,3 +91,15 @@ def test_decimal_year_and_unknown_dates():
     assert abs(decimal_year(1_751_457_600 * 10**9) - 2025.5) < 1e-6  # 2025-07-02T12:00Z
     with pytest.raises(ImuFusionError, match="Unix time"):
         magnetic_field_world(47.0, 10.0, 0.0, decimal_year(0))
+
+
+def test_plumb_line_turns_with_the_place():
+    # Up at a place 5 km east: the ellipsoid normal there, in the axes of the origin.
+    frame = LocalFrame(47.4, 10.3, 900.0)
+    there = frame.to_geodetic(np.array([5000.0, 0.0, 0.0]))
+    up = frame.to_enu(there[0], there[1], there[2] + 1.0) - [5000.0, 0.0, 0.0]
+    g = gravity_world(np.array([5000.0, 0.0, 0.0]), 9.8)
+    # The local radii of curvature differ from the mean radius by up to 0.7 %.
+    assert np.allclose(-g / np.linalg.norm(g), up, atol=0.01 * 5000 / 6.37e6)
+    higher = gravity_world(np.array([0.0, 0.0, 100.0]), 9.8)
+    assert abs((higher[2] + 9.8) / 100.0 - 3.08e-6) < 2e-8  # free-air gradient
