@@ -55,7 +55,7 @@ def detect_jump(imu, velocity):
     return JumpEvents(early, late - int(_LEAD * 1e9))
 
 
-def impact_onset(imu, touchdown, before=0.25, after=0.15):
+def impact_onset(imu, touchdown, before=0.4, after=0.35):
     """Stamp at which the force of the impact sets in, near a first guess.
 
     The specific force in the air varies slowly; the impact is the first sample that leaves

@@ -33,5 +33,6 @@ def attitude_from_vectors(acc, mag, field_world):
 
 def headings(quat, count):
     """``count`` attitudes (count, 4): ``quat`` turned about the vertical in equal steps."""
-    turns = Rotation.from_euler("z", 2.0 * np.pi * np.arange(count) / count)
+    angles = 2.0 * np.pi * np.arange(count)[:, None] / count
+    turns = Rotation.from_rotvec(angles * [0.0, 0.0, 1.0])
     return (turns * Rotation.from_quat(quat)).as_quat()

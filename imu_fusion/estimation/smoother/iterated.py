@@ -17,8 +17,6 @@ import numpy as np
 from imu_fusion.estimation.smoother import kernel, model
 from imu_fusion.estimation.smoother.inputs import evaluate_constraints
 
-_SEGMENT = 256  # samples that the backward pass keeps in memory at once
-_SEARCH = 12    # headings tried when nothing else tells it
 
 
 @dataclass
@@ -41,14 +39,13 @@ class Problem:
 
     def __post_init__(self):
         n = len(self.prior_sd)
-        self.inputs, self.steps = self.imu.means, self.imu.steps
-        self.model = np.concatenate([[self.gravity], self.decay_rate, self.walk])
         columns = list(range(model.ATT, model.CORE))
         for block, width in ((model.ACC_MATRIX, 9), (model.GYR_SCALE, 3)):
             if self.layout[block] >= 0:
                 columns += range(self.layout[block], self.layout[block] + width)
-        self.columns = np.array(columns)
-        self.lever_arm = np.array(self.params.gnss_lever_arm)
+        self.motion = (self.imu.steps, self.imu.means, self.imu.noise, self.gravity,
+                       self.decay_rate, self.walk, self.layout, np.array(columns),
+                       self.field_world, np.array(self.params.gnss_lever_arm))
         self.size = n
         self.attach(0.0)
         no_rows = np.zeros(len(self.imu.log) + 1, np.int64)
@@ -62,34 +59,12 @@ class Problem:
                          m.whiten[self.order], m.loss[self.order])
         self.innovation = np.zeros((len(self.order), 3))
 
-    def _no_storage(self):
-        return (np.empty((0, 0)), np.empty((0, 0), np.int64), np.empty(0, np.int64),
-                np.empty((0, 0)), np.empty(0), np.empty(0, np.int64), np.empty((0, 0)),
-                np.empty((0, 0, 0)))
-
-    def _run(self, first, last, follow, delta, cov, storage=None):
-        return kernel.filter_segment(
-            first, last, follow, self.x, delta, cov, self.steps, self.inputs, self.imu.noise,
-            self.model, self.layout, self.columns, self.field_world, self.lever_arm,
-            *self.attached, *self.rows, self.innovation, storage is not None,
-            *(self._no_storage() if storage is None else storage))
-
-    def _storage(self):
-        start, rows = self.attached[0], self.rows[0]
-        edges = np.arange(0, len(self.x) + _SEGMENT, _SEGMENT).clip(max=len(self.x))
-        most = int((3 * np.diff(start[edges]) + np.diff(rows[edges])).max(initial=1))
-        n = self.size
-        return (np.empty((most, kernel.MAX_ENTRIES)),
-                np.empty((most, kernel.MAX_ENTRIES), np.int64), np.empty(most, np.int64),
-                np.empty((most, n)), np.empty(most), np.empty(_SEGMENT + 1, np.int64),
-                np.empty((_SEGMENT, n)), np.empty((_SEGMENT, n, n)))
-
     def follow(self, count=None):
         """Extended Kalman filter over the first ``count`` samples; writes x."""
         self.x[0] = self.prior
         count = len(self.x) if count is None else count
-        delta, cov = np.zeros(self.size), np.diag(self.prior_sd ** 2)
-        cost = self._run(0, count, True, delta, cov)
+        cost = kernel.follow(self.x, count, np.diag(self.prior_sd ** 2), self.motion,
+                             self.attached, self.rows, self.innovation)
         # A heading is judged by what the filter did not expect, not by what it ended with.
         start = self.attached[0]
         squares = (self.innovation[:start[count]] ** 2).sum(axis=1)
@@ -98,13 +73,14 @@ class Problem:
     def search_heading(self, candidates):
         """Filter the beginning from each attitude (k, 4); keep the most plausible one.
 
-        The beginning ends where the GNSS has moved enough to tell headings apart.
+        The beginning ends where the fixes have moved far beyond their noise, which is what
+        tells headings apart.
         """
-        start, kind, _, value = self.attached[:4]
+        start, kind, _, value, whiten = self.attached[:5]
         sample = np.repeat(np.arange(len(self.x)), np.diff(start))
         fixes = kind == model.FIX
         apart = np.linalg.norm(value[fixes] - value[fixes][0], axis=1)
-        moved = np.flatnonzero(apart > 100.0)
+        moved = np.flatnonzero(apart * whiten[fixes, 0, 0] > 20.0)
         count = len(self.x) if not len(moved) else int(sample[fixes][moved[0]]) + 1
         scores = []
         for quat in candidates:
@@ -126,29 +102,17 @@ class Problem:
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
         kernel.boxminus(self.prior, self.x[0], delta)
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
-        edges = list(range(0, total, _SEGMENT)) + [total]
-        kept_delta = np.empty((len(edges) - 1, n))
-        kept_cov = np.empty((len(edges) - 1, n, n))
-        cost = prior_cost
-        for i, (first, last) in enumerate(zip(edges[:-1], edges[1:])):
-            kept_delta[i], kept_cov[i] = delta, cov
-            cost += self._run(first, last, False, delta, cov)
-
-        adjoint, adjoint_cov = np.zeros(n), np.zeros((n, n))
-        storage, step = self._storage(), np.empty((_SEGMENT, n))
         covariances = np.empty((total if with_cov else 0, 3, 3, 3))
         variances = np.empty((total if with_cov else 0, n - 9))
-        largest, process = np.zeros(3), 0.0
-        for i in range(len(edges) - 2, -1, -1):
-            first, last = edges[i], edges[i + 1]
-            self._run(first, last, False, kept_delta[i], kept_cov[i], storage)
-            process += kernel.smooth_segment(
-                first, last, self.x, adjoint, adjoint_cov, self.steps, self.inputs,
-                self.imu.noise, self.model, self.layout, self.columns, *storage, with_cov, step,
-                covariances, variances)
-            kernel.apply_step(self.x[first:last], step, largest)
-        self.cost.append(0.5 * (cost + self.process))
+        cost, process, largest = kernel.solve_linear(
+            self.x, delta, cov, self.motion, self.attached, self.rows, self.innovation, with_cov,
+            covariances, variances)
+        self.cost.append(0.5 * (prior_cost + cost + self.process))
         self.process = process
+        if with_cov:
+            sampled = np.append(np.arange(0, total - 1, kernel.THINNING), total - 1)
+            for column in variances.T:
+                column[:] = np.interp(np.arange(total), sampled, column[sampled])
         return largest, covariances, variances
 
     process = 0.0  # of the trajectory that the last step left

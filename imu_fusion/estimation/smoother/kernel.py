@@ -24,6 +24,12 @@ from imu_fusion.geometry.rotation import quat_conjugate, quat_exp, quat_log, qua
 #: Longest list of non-zero entries of a measurement row.
 MAX_ENTRIES = 24
 
+#: Samples kept at once by the backward pass.
+SEGMENT = 128
+
+#: Variances of the slow states are computed for every so many samples.
+THINNING = 16
+
 
 @njit(cache=True)
 def boxplus(x, delta):
@@ -108,10 +114,8 @@ def _slow_noise(walk, rate, dt, factor):
 
 
 @njit(cache=True)
-def filter_segment(first, last, follow, x, delta, cov, stamps, inputs, noise, model, layout,
-                   columns, field, lever_arm, m_start, m_kind, m_tau, m_value, m_whiten, m_loss,
-                   c_start, c_residual, c_gradient, c_sigma, c_height, innovation, store,
-                   r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov):
+def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, innovation,
+                   store, storage):
     """Filter samples first <= k < last; ``delta`` and ``cov`` are those before the rows of
     ``first`` on entry, before the rows of ``last`` on return.
 
@@ -119,22 +123,26 @@ def filter_segment(first, last, follow, x, delta, cov, stamps, inputs, noise, mo
         follow: the nominal trajectory follows the filter (extended Kalman filter, writes x)
             instead of being kept (linear pass about x).
         x: nominal states (N, n + 1).
-        stamps: steps dt (N - 1,) s.
-        inputs: gyr, acc means (N - 1, 6).
-        noise: variance densities of gyr, acc (N - 1, 6).
-        model: gravity, then decay rates (n,) and walk variance densities (n,).
-        m_*: measurements sorted by sample; m_start (N + 1,).
-        m_loss: squared scale of the robust loss, 0 for the squared loss.
-        c_*: constraint rows sorted by sample.
+        motion: steps dt (N - 1,) s; means of gyr and acc (N - 1, 6); their noise variance
+            densities (N - 1, 6); gravity; decay rates (n,) and walk variance densities (n,) of
+            the slow states; layout; columns of the transition matrix in use; magnetic field
+            (3,); lever arm (3,).
+        measured: sorted by sample: start (N + 1,), kind, tau, value (M, 3), whitening matrix
+            (M, 3, 3), squared scale of the robust loss (0: squared loss).
+        rows: constraints sorted by sample: start (N + 1,), residual, gradient, sigma, height.
         innovation: (M, 3) normalised innovations, result.
-        store: whether to fill r_* (rows) and s_* (state after the rows) for the backward pass.
+        store: whether to fill ``storage`` for the backward pass: entries, indices, count, gain,
+            value and start of the rows; deviation and covariance after the rows.
 
     Returns:
         Sum of the losses of all rows at the nominal trajectory.
     """
+    stamps, inputs, noise, gravity, rates, walks, layout, columns, field, lever_arm = motion
+    m_start, m_kind, m_tau, m_value, m_whiten, m_loss = measured
+    c_start, c_residual, c_gradient, c_sigma, c_height = rows
+    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
     n = len(delta)
     n_total = len(x)
-    gravity = model[0]
     f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
     x_next, rate, force = np.empty(n + 1), np.empty(3), np.empty(3)
     rotation, middle, spread = np.eye(3), np.eye(3), np.empty((3, 3))
@@ -150,7 +158,7 @@ def filter_segment(first, last, follow, x, delta, cov, stamps, inputs, noise, mo
         if has_interval:
             dt = stamps[k]
             for i in range(9, n):
-                decay[i] = 1.0 if model[1 + i] == 0.0 else math.exp(-model[1 + i] * dt)
+                decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
             rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, decay,
                                         layout, f_vel, f_att, x_next, rate, force)
         if layout[LEVER_ARM] >= 0:
@@ -262,7 +270,7 @@ def filter_segment(first, last, follow, x, delta, cov, stamps, inputs, noise, mo
                 cov[VEL + i, POS + j] += 0.5 * dt * spread[i, j]
                 cov[POS + i, POS + j] += 0.25 * dt * dt * spread[i, j]
         for i in range(9, n):
-            cov[i, i] += _slow_noise(model[1 + n + i], model[1 + i], dt, decay[i])
+            cov[i, i] += _slow_noise(walks[i], rates[i], dt, decay[i])
         # The two products round differently on either side of the diagonal.
         for i in range(n):
             for j in range(i):
@@ -314,20 +322,22 @@ def _store_row(at, entries, used, count, gain, value, root, r_entries, r_index, 
 
 
 @njit(cache=True)
-def smooth_segment(first, last, x, adjoint, adjoint_cov, stamps, inputs, noise, model, layout,
-                   columns, r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta,
-                   s_cov, with_cov, step, cov_out, var_out):
+def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_cov, step,
+                   cov_out, var_out):
     """Backward pass over first <= k < last; the adjoints are those at ``last`` before its rows
     on entry, at ``first`` before its rows on return.
 
     Args:
+        motion, storage: as in :func:`filter_segment`.
         step: (last - first, n) smoothed deviations, result.
         cov_out: (N, 3, 3, 3) covariances of position, velocity, attitude, result.
-        var_out: (N, n - 9) variances of the other states, result.
+        var_out: (N, n - 9) variances of the other states, result; every THINNING-th sample.
 
     Returns:
         Sum of the squared normalised process noise.
     """
+    stamps, inputs, noise, gravity, rates, walks, layout, columns, _, _ = motion
+    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
     n = len(adjoint)
     f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
     x_next, rate, force = np.empty(n + 1), np.empty(3), np.empty(3)
@@ -340,8 +350,8 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, stamps, inputs, noise, 
         if k < len(x) - 1:
             dt = stamps[k]
             for i in range(9, n):
-                decay[i] = 1.0 if model[1 + i] == 0.0 else math.exp(-model[1 + i] * dt)
-            _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, model[0], decay,
+                decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
+            _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, decay,
                                  layout, f_vel, f_att, x_next, rate, force)
             _interval_noise(noise[k, 3:6], middle, dt, spread)
             for i in range(3):
@@ -350,7 +360,7 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, stamps, inputs, noise, 
                     cost += (spread[i, j] * (adjoint[VEL + i] + 0.5 * dt * adjoint[POS + i])
                              * (adjoint[VEL + j] + 0.5 * dt * adjoint[POS + j]))
             for i in range(9, n):
-                cost += (_slow_noise(model[1 + n + i], model[1 + i], dt, decay[i])
+                cost += (_slow_noise(walks[i], rates[i], dt, decay[i])
                          * adjoint[i] ** 2)
             column[:, 0] = adjoint
             _adjoint_rows(column, column_out, dt, decay, f_vel, f_att, columns)
@@ -369,7 +379,8 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, stamps, inputs, noise, 
             for i in range(n):
                 step[k - first, i] += cov[j, i] * a
         if with_cov:
-            _smoothed_cov(k, cov, adjoint_cov, work, cov_out, var_out)
+            slow = k % THINNING == 0 or k == len(x) - 1
+            _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out)
         for r in range(r_start[k - first + 1] - 1, r_start[k - first] - 1, -1):
             gain = r_gain[r]
             value = r_value[r]
@@ -402,10 +413,10 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, stamps, inputs, noise, 
 
 
 @njit(cache=True)
-def _smoothed_cov(k, cov, adjoint_cov, work, cov_out, var_out):
+def _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out):
     """Blocks of P - P L P that are reported."""
     n = len(cov)
-    for i in range(n):
+    for i in range(n if slow else 9):
         for j in range(n):
             work[i, j] = 0.0
         for m in range(n):
@@ -421,6 +432,8 @@ def _smoothed_cov(k, cov, adjoint_cov, work, cov_out, var_out):
                     total -= work[3 * b + i, m] * cov[m, 3 * b + j]
                 cov_out[k, b, i, j] = total
                 cov_out[k, b, j, i] = total
+    if not slow:
+        return
     for i in range(9, n):
         total = cov[i, i]
         for m in range(n):
@@ -438,3 +451,56 @@ def apply_step(x, step, largest):
             size = math.sqrt(step[k, 3 * b] ** 2 + step[k, 3 * b + 1] ** 2
                              + step[k, 3 * b + 2] ** 2)
             largest[b] = max(largest[b], size)
+
+
+@njit(cache=True)
+def follow(x, count, cov, motion, measured, rows, innovation):
+    """Extended Kalman filter over the first ``count`` samples from x[0]; writes x."""
+    n = len(cov)
+    return filter_segment(0, count, True, x, np.zeros(n), cov, motion, measured, rows,
+                          innovation, False, _storage(0, 0, n))
+
+
+@njit(cache=True)
+def _storage(n_samples, n_rows, n):
+    return (np.empty((n_rows, MAX_ENTRIES)), np.empty((n_rows, MAX_ENTRIES), np.int64),
+            np.empty(n_rows, np.int64), np.empty((n_rows, n)), np.empty(n_rows),
+            np.empty(n_samples + 1, np.int64), np.empty((n_samples, n)),
+            np.empty((n_samples, n, n)))
+
+
+@njit(cache=True)
+def solve_linear(x, delta, cov, motion, measured, rows, innovation, with_cov, cov_out, var_out):
+    """Solve the problem linearised about x (N, n + 1) and move x to its solution.
+
+    Args:
+        delta, cov: prior deviation (n,) and covariance (n, n) of the first sample.
+        Others as in :func:`filter_segment` and :func:`smooth_segment`.
+
+    Returns:
+        Loss of all rows before the step, squared normalised process noise after it, largest
+        changes (3,) of position, velocity and attitude.
+    """
+    total, n = len(x), len(delta)
+    count = (total + SEGMENT - 1) // SEGMENT
+    kept_delta, kept_cov = np.empty((count, n)), np.empty((count, n, n))
+    most, cost, process = 0, 0.0, 0.0
+    nothing = _storage(0, 0, n)
+    for s in range(count):
+        first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
+        kept_delta[s], kept_cov[s] = delta, cov
+        most = max(most, 3 * (measured[0][last] - measured[0][first])
+                   + rows[0][last] - rows[0][first])
+        cost += filter_segment(first, last, False, x, delta, cov, motion, measured, rows,
+                               innovation, False, nothing)
+    storage = _storage(SEGMENT, most, n)
+    step, largest = np.empty((SEGMENT, n)), np.zeros(3)
+    adjoint, adjoint_cov = np.zeros(n), np.zeros((n, n))
+    for s in range(count - 1, -1, -1):
+        first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
+        filter_segment(first, last, False, x, kept_delta[s], kept_cov[s], motion, measured,
+                       rows, innovation, True, storage)
+        process += smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage,
+                                  with_cov, step, cov_out, var_out)
+        apply_step(x[first:last], step, largest)
+    return cost, process, largest

@@ -48,6 +48,16 @@ def _cross_matrix(m, v, scale, out, row, column):
 
 
 @njit(cache=True)
+def _product(a, b):
+    """a @ b for 3 x 3 matrices (the library call costs more than the product)."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+    return out
+
+
+@njit(cache=True)
 def interval(x, gyr, acc, dt, gravity, decay, layout, f_vel, f_att, x_next, rate, force_world):
     """Carry the state x over one interval; derivatives of velocity and attitude.
 
@@ -80,10 +90,10 @@ def interval(x, gyr, acc, dt, gravity, decay, layout, f_vel, f_att, x_next, rate
                 force[i] += x[layout[ACC_MATRIX] + 1 + 3 * i + j] * acc[j]
     turn = rate * dt
     half = quat_exp(0.5 * turn)
-    quat = x[6:10].copy()
-    middle_quat = quat_multiply(quat, half)
-    start = quat_to_matrix(quat)
-    middle = quat_to_matrix(middle_quat)
+    middle_quat = quat_multiply(x[6:10], half)
+    start = quat_to_matrix(x[6:10])
+    half_turn = quat_to_matrix(half)
+    middle = _product(start, half_turn)
     g = gravity_world(x[0:3], gravity)
     for i in range(3):
         force_world[i] = (middle[i, 0] * force[0] + middle[i, 1] * force[1]
@@ -95,17 +105,17 @@ def interval(x, gyr, acc, dt, gravity, decay, layout, f_vel, f_att, x_next, rate
         x_next[i + 1] = decay[i] * x[i + 1]
 
     # Attitude: Exp(-turn) of the old error, and the right Jacobian of the rate's.
-    quat_back = quat_exp(-turn)
-    f_att[:, ATT:ATT + 3] = quat_to_matrix(quat_back)
+    whole_turn = _product(half_turn, half_turn)
     jacobian = right_jacobian(turn)
-    f_att[:, GYR_BIAS:GYR_BIAS + 3] = -dt * jacobian
     # Velocity: the error of the attitude in the middle is that of the start, turned by half.
-    half_turn = quat_to_matrix(quat_exp(-0.5 * turn))
-    lever = np.zeros((3, 3))
+    lever = np.empty((3, 3))
     _cross_matrix(middle, force, -dt, lever, 0, 0)
-    f_vel[:, ATT:ATT + 3] = lever @ half_turn
     for i in range(3):
         for j in range(3):
+            f_att[i, ATT + j] = whole_turn[j, i]
+            f_att[i, GYR_BIAS + j] = -dt * jacobian[i, j]
+            f_vel[i, ATT + j] = (lever[i, 0] * half_turn[j, 0] + lever[i, 1] * half_turn[j, 1]
+                                 + lever[i, 2] * half_turn[j, 2])
             f_vel[i, GYR_BIAS + j] = -0.5 * dt * lever[i, j]
             f_vel[i, ACC_BIAS + j] = -dt * middle[i, j]
     if layout[GYR_SCALE] >= 0:

@@ -164,17 +164,17 @@ class Smoother:
         problem.prior, problem.x = prior, np.empty((len(log), size + 1))
         if i >= 0:
             prior[i + 1] = p.body_height
-        if initial_quat is not None:
-            prior[6:10] = initial_quat
-            return
-        if np.any(kind == model.MAG):
-            early = mag.between(log.stamp[0], log.stamp[beginning])
-            reading = early.mag[np.isfinite(early.mag).all(axis=1)].mean(axis=0)
-            if np.isfinite(reading).all():
-                prior[6:10] = initial.attitude_from_vectors(acc, reading, problem.field_world)
-                return
-        quat = initial.attitude_from_vectors(acc, None, None)
-        problem.search_heading(initial.headings(quat, 12))
+        # Quarter turns insure against a disturbed or mounted-over magnetometer.
+        candidates = 4
+        if initial_quat is None:
+            reading = None
+            if np.any(kind == model.MAG):
+                early = mag.between(log.stamp[0], log.stamp[beginning] + 1)
+                finite = np.isfinite(early.mag).all(axis=1)
+                reading = early.mag[finite].mean(axis=0) if finite.any() else None
+            initial_quat = initial.attitude_from_vectors(acc, reading, problem.field_world)
+            candidates = 12 if reading is None else 4
+        problem.search_heading(initial.headings(initial_quat, candidates))
 
     def _result(self, problem, frame, imu, hill, events, steps, converged, cov, var):
         recorded = problem.imu.recorded
