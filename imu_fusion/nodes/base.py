@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+from imu_fusion.nodes.flow import steady_timer
 
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
@@ -103,7 +104,7 @@ class Node(rclpy.node.Node):
             array.header.stamp = self.get_clock().now().to_msg()
             self._diagnostics.publish(array)
 
-        self.create_timer(1.0, publish)
+        steady_timer(self, 1.0, publish)
 
     def _declare(self):
         # rclpy has declared what was given, with the type that it was given in. Take it
