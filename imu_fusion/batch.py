@@ -13,7 +13,7 @@ from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages import orientation_stream as orientation
 from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
-from imu_fusion.messages.convert import LOGS
+from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.layouts import IMU, MAG
 from imu_fusion.parameter_file import parameters_for
 from imu_fusion.samples.guard import guard_log
@@ -133,7 +133,8 @@ def _read(reader, names):
     raw = {name: [] for name in names}
     for topic, _, _, cdr in reader.messages(names):
         raw[topic].append(cdr)
-    logs = {name: LOGS[reader.topics[name].msgtype](messages) for name, messages in raw.items()}
+    logs = {name: SAMPLE_TYPES[reader.topics[name].msgtype].read(messages)
+            for name, messages in raw.items()}
     return {name: (log, *guard_log(log)) for name, log in logs.items()}
 
 

@@ -31,8 +31,8 @@ class EstimatorNode(Node):
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()
         self._names = {}  # resolved name -> ours
-        for topic, (layout, _) in stream.inputs.items():
-            inbox = self._relay.subscribe(message_class(layout.msgtype), topic,
+        for topic, kind in stream.inputs.items():
+            inbox = self._relay.subscribe(message_class(kind.layout.msgtype), topic,
                                           lambda cdr, _, topic=topic: stream.push(topic, cdr), qos)
             self._names[inbox.topic] = topic
         self.start_diagnostics(self._status)
