@@ -6,11 +6,23 @@ adds recordings.
 """
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
 from imu_fusion.errors import MessageError
+from imu_fusion.parameters import Parameters, param
 from imu_fusion.samples.merge import RESTART, SampleStream
+
+
+@dataclass(frozen=True)
+class EstimatorNodeParams(Parameters):
+    """What concerns a node, not its estimate."""
+
+    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
+                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
+                         "for repeats of what was lost (replay).")
+
 
 _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
 

@@ -1,22 +1,11 @@
 """What the nodes of all streaming estimators share: a Stream between DDS topics."""
 
-from dataclasses import dataclass
-
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
-from imu_fusion.parameters import Parameters, param
 from imu_fusion.samples.guard import Verdict
-
-
-@dataclass(frozen=True)
-class EstimatorNodeParams(Parameters):
-    """What concerns the node, not the estimate."""
-
-    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
-                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
-                         "for repeats of what was lost (replay).")
 
 
 class EstimatorNode(Node):
