@@ -1,7 +1,7 @@
 """What is in a recording, topic by topic: rates, gaps, ranges, and what looks wrong."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,15 +25,20 @@ class Range:
 
 @dataclass(frozen=True)
 class TopicReport:
-    """One topic: ``timing`` of its header stamps (log times, if it is not ``stamped`` because
-    its messages have no header), ``ranges`` of what it measures, ``findings`` about it."""
+    """One topic: ``stamp`` (n,) int64 ns of its headers (log times, if it is not ``stamped``
+    because its messages have no header) and their ``timing``, ``ranges`` of what it measures,
+    ``findings`` about it."""
 
     topic: str
     msgtype: str
-    timing: checks.Timing
-    ranges: tuple
-    findings: tuple
+    stamp: np.ndarray = field(repr=False, compare=False)
+    ranges: tuple = ()
+    findings: tuple = ()
     stamped: bool = True
+    timing: checks.Timing = field(init=False)
+
+    def __post_init__(self):
+        object.__setattr__(self, "timing", checks.timing(self.stamp))
 
     @property
     def count(self):
@@ -71,7 +76,7 @@ def inspect_topics(reader):
             try:
                 logs[name] = read_log(reader, name)
             except MessageError as error:
-                reports.append(TopicReport(name, info.msgtype, checks.timing([]), (), (
+                reports.append(TopicReport(name, info.msgtype, np.empty(0, np.int64), (), (
                     checks.Finding("type", f"{name}: {error}"),)))
                 continue
             report = inspect_log(name, info.msgtype, logs[name])
@@ -104,9 +109,8 @@ def inspect_log(name, msgtype, log):
         ranges = ()
         if isinstance(log, PoseLog):
             findings += checks.check_finite(log.quat_world_imu, name, "orientation")
-            ranges = (_range("|quaternion|", "", _norm(log.quat_world_imu)),)
-    return TopicReport(name, msgtype, checks.timing(log.stamp),
-                       tuple(r for r in ranges if r is not None), tuple(findings))
+    return TopicReport(name, msgtype, log.stamp, (r for r in ranges if r is not None),
+                       tuple(findings))
 
 
 def _with_axes(report, logs):
@@ -115,8 +119,8 @@ def _with_axes(report, logs):
     log = logs.get(report.topic)
     if not isinstance(log, MagLog) or len(imus) != 1:
         return report
-    findings = (*report.findings, *checks.check_axes(imus[0], log, report.topic))
-    return TopicReport(report.topic, report.msgtype, report.timing, report.ranges, findings)
+    return replace(report, findings=(*report.findings,
+                                     *checks.check_axes(imus[0], log, report.topic)))
 
 
 def _inspect_stamps(reader, name, info):
@@ -130,9 +134,10 @@ def _inspect_stamps(reader, name, info):
             stamps.append(sec * NANOSECONDS + nanosec)
         else:
             stamps.append(log_time)
+    stamps = np.array(stamps, dtype=np.int64)
     # Without a header, messages may be sent at any time: gaps mean nothing.
     findings = checks.check_stamps(stamps, name) if stamped else []
-    return TopicReport(name, info.msgtype, checks.timing(stamps), (), tuple(findings), stamped)
+    return TopicReport(name, info.msgtype, stamps, (), tuple(findings), stamped)
 
 
 def _norm(vectors):

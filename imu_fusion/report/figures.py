@@ -53,11 +53,12 @@ class Band:
 
 @dataclass(frozen=True)
 class Panel:
-    """What stands over one vertical axis; ``label`` names quantity and unit."""
+    """What stands over one vertical axis; ``label`` names quantity and unit, ``title`` (text
+    from outside) stands in the lower left corner."""
 
     label: str
     items: tuple
-    log: bool = False
+    title: str = ""
     from_zero: bool = False
 
 
@@ -82,12 +83,16 @@ def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
         for item in panel.items:
             for trace in _traces(item, named):
                 figure.add_trace(trace, row=row, col=1)
-        figure.update_yaxes(type="log" if panel.log else "linear",
-                            rangemode="tozero" if panel.from_zero else "normal", row=row, col=1)
+        figure.update_yaxes(rangemode="tozero" if panel.from_zero else "normal", row=row, col=1)
         # Axis titles would stand at a distance that depends on their tick labels.
         figure.add_annotation(text=panel.label, textangle=-90, showarrow=False, xref="paper", x=0,
                               xshift=-62, yref=f"y{row if row > 1 else ''} domain", y=0.5,
                               xanchor="center", yanchor="middle", font=dict(size=13))
+        if panel.title:
+            figure.add_annotation(text=plain(panel.title), showarrow=False, xref="paper", x=0,
+                                  xshift=6, yref=f"y{row if row > 1 else ''} domain", y=0.04,
+                                  xanchor="left", yanchor="bottom", font=dict(size=12),
+                                  bgcolor="rgba(255,255,255,0.75)")
     if len(shaded):
         _shade(figure, shaded, shaded_name)
     figure.update_layout(
@@ -121,6 +126,18 @@ def break_wraps(angle_deg):
     return result
 
 
+def break_gaps(time, values):
+    """A signal with NaN put into its gaps: intervals of more than ten usual ones."""
+    step = np.diff(time)
+    if len(step) == 0:
+        return time, values
+    gaps = np.flatnonzero(step > 10 * np.median(step)) + 1
+    if len(gaps) == 0:
+        return time, values
+    return (np.insert(np.asarray(time, dtype=np.float64), gaps, time[gaps - 1]),
+            np.insert(np.asarray(values, dtype=np.float64), gaps, np.nan))
+
+
 def _traces(item, named):
     first = item.name not in named
     named.add(item.name)
@@ -135,7 +152,7 @@ def _traces(item, named):
             y=_compact(np.concatenate([high, low[::-1]])), mode="lines", line=dict(width=0),
             fill="toself", fillcolor=f"rgba({red},{green},{blue},{item.opacity})",
             hoverinfo="skip", **common)]
-    time, values = decimate(item.time, item.values)
+    time, values = decimate(*break_gaps(item.time, item.values))
     return [go.Scatter(
         x=_compact(time), y=_compact(values), mode="markers" if item.markers else "lines",
         line=dict(color=item.color, width=item.width, dash=item.dash, simplify=False),

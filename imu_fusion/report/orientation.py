@@ -78,14 +78,17 @@ def orientation_section(stamp, quat_world_imu, cov_attitude, origin, reference=N
                "errors are judged below without angles that can do that."),))
 
 
-def error_section(errors, origin, moving=None, reference_name="reference", shaded=()):
+def error_section(errors, origin, moving=None, reference_name="reference", is_truth=True,
+                  shaded=()):
     """Section with the errors against a reference and their statistics.
 
     Args:
         errors: OrientationErrors.
         origin: int ns, zero of the time axis.
         moving: (n,) bool, or None.
+        is_truth: whether the reference is so much better that differences are errors.
     """
+    word = "error" if is_truth else "difference"
     time = seconds(errors.stamp, origin)
     rows = []
     for label, mask in ((_MOVING, moving), ("all samples", None)):
@@ -94,23 +97,25 @@ def error_section(errors, origin, moving=None, reference_name="reference", shade
         for row in orientation_error.statistics(errors, mask):
             rows.append((label, row.name, number(row.rmse_deg, 2), number(row.median_deg, 2),
                          number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count))
-    table = Table(("samples", "error angle", "RMSE °", "median °", "95 % below °", "largest °",
+    table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
-                  f"Error against {reference_name}. The error rotation (estimate times inverse "
+                  f"{word.capitalize()} against {reference_name}. The {word} rotation (estimate times inverse "
                   "reference, in the world) is split as in BROAD (Laidig et al. 2021) into a "
                   "heading part about the vertical and an inclination part about a horizontal "
                   "axis.")
-    blocks = [table, *_honesty(errors, moving)]
+    blocks = [table]
+    if is_truth:
+        blocks += _honesty(errors, moving)
     panels = []
     for i, name in enumerate(("tilt about east", "tilt about north", "heading")):
         sd = np.degrees(errors.sd_world[:, i])
         panels.append(Panel(f"{name} in °", (
             Band("±3σ stated", time, -3 * sd, 3 * sd, opacity=0.18),
             Band("±1σ stated", time, -sd, sd, opacity=0.38),
-            Line("error", time, np.degrees(errors.rotation_world[:, i]), fig.ESTIMATE))))
+            Line(word, time, np.degrees(errors.rotation_world[:, i]), fig.ESTIMATE))))
     blocks.append(Figure(
         time_figure(panels, shaded, _MOVING),
-        "The error rotation in the axes of the world with the standard deviations that the "
+        f"The {word} rotation in the axes of the world with the standard deviations that the "
         "estimator stated."))
     variance = errors.sd_world ** 2
     panels = []
@@ -119,13 +124,14 @@ def error_section(errors, origin, moving=None, reference_name="reference", shade
         panels.append(Panel(f"{name} in °", (
             Band("3σ stated", time, 0 * expected, 3 * expected, opacity=0.18),
             Band("1σ stated", time, 0 * expected, expected, opacity=0.38),
-            Line("error angle", time, np.degrees(getattr(errors, name)), fig.ESTIMATE)),
+            Line(f"{word} angle", time, np.degrees(getattr(errors, name)), fig.ESTIMATE)),
             from_zero=True))
     blocks.append(Figure(
         time_figure(panels, shaded, _MOVING, panel_height=160),
-        "The error angles of the table; σ is the root of the sum of the variances involved, that "
+        f"The {word} angles of the table; σ is the root of the sum of the variances involved, that "
         "is the RMS that the estimator expected."))
-    return Section("Error against the reference", tuple(blocks))
+    return Section("Error against the reference" if is_truth
+                   else f"Difference from {reference_name}", tuple(blocks))
 
 
 def _honesty(errors, moving):
@@ -205,21 +211,22 @@ def motion_section(raw, corrected, origin, shaded=()):
         Figure(time_figure(panels, shaded, _MOVING), " ".join(caption)),))
 
 
-def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0):
+def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0, is_truth=True):
     """The numbers at the top of a report."""
     items = [Number("Duration", f"{duration_s:.1f} s"),
              Number("Imu", f"{number(imu_rate_hz, 1)} Hz", "mean rate")]
     if errors is not None:
-        where = _MOVING if moving is not None else "of all samples"
+        where = "moving" if moving is not None else "all samples"
+        word = "error" if is_truth else "difference"
         for row in orientation_error.statistics(errors, moving):
-            items.append(Number(f"{row.name.capitalize()} error", f"{number(row.rmse_deg, 2)}°",
-                                f"RMSE {where}"))
-        shares = orientation_error.shares_within(errors, moving)
+            items.append(Number(f"{row.name.capitalize()} {word}", f"{number(row.rmse_deg, 2)}°",
+                                f"RMS, {where}"))
+        shares = orientation_error.shares_within(errors, moving) if is_truth else {}
         for name, values in shares.items():
             if np.isfinite(values[0]):
-                items.append(Number(f"{name.capitalize()} within 3σ", f"{100 * values[2]:.1f} %",
+                items.append(Number(f"{name.capitalize()} ≤ 3σ", f"{100 * values[2]:.1f} %",
                                     "Gaussian: 99.7 %"))
-    items.append(Number("Remarks", str(findings), "on stamps, units, ranges"))
+    items.append(Number("Remarks", str(findings), "on stamps, units"))
     return Numbers(tuple(items))
 
 

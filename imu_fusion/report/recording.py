@@ -13,7 +13,7 @@ from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, IMU, MAG, POSE
 from imu_fusion.report.figures import intervals
-from imu_fusion.report.html import Section, Text, write_report
+from imu_fusion.report.html import Notes, Section, Text, write_report
 from imu_fusion.report.orientation import (
     error_section, field_section, key_numbers, motion_section, orientation_section)
 from imu_fusion.report.overview import overview_section
@@ -54,8 +54,6 @@ def write_orientation_report(bag, estimates, path):
         raise TopicError(f"{bag}: no topics to report about")
 
     raw, mag = logs.get(RAW), logs.get(MAGNETOMETER)
-    stamps = {t.topic: log.stamp for name, log in logs.items()
-              for t in topics if t.topic.lstrip("/") == name}
     clock = raw if raw is not None else estimate
     origin = int(clock.stamp[0]) if clock is not None and len(clock) else start
     errors = moving = None
@@ -69,18 +67,25 @@ def write_orientation_report(bag, estimates, path):
 
     rate = next((t.rate for t in topics if t.topic.lstrip("/") == RAW), None)
     findings = sum(len(t.findings) for t in topics) + len(warnings)
-    blocks = [key_numbers(duration, np.nan if rate is None else rate, errors, moving, findings)]
-    blocks += [Text(warning) for warning in warnings]
+    is_truth = reference_name == REFERENCE
+    blocks = [key_numbers(duration, np.nan if rate is None else rate, errors, moving, findings,
+                          is_truth)]
+    if warnings:
+        blocks.append(Notes(tuple(warnings)))
     if estimate is None:
         blocks.append(Text(f"{Path(estimates).name} holds no estimates on {ESTIMATES}: this "
                            "report is about the recording alone. imu_fusion process makes them."))
-    sections = [Section("Summary", tuple(blocks)), overview_section(topics, stamps, origin)]
+    elif errors is not None:
+        blocks.append(Text(f"Orientation from {Path(estimates)} against {reference_name} of the "
+                           "recording" + ("." if is_truth else ", which is somebody's estimate "
+                                          "too: what follows are differences, not errors.")))
+    sections = [Section("Summary", tuple(blocks)), overview_section(topics, origin)]
     if estimate is not None:
         sections.append(orientation_section(
             estimate.stamp, estimate.quat_world_imu, estimate.cov_attitude, origin, reference,
             reference_name or "", shaded))
     if errors is not None:
-        sections.append(error_section(errors, origin, moving, reference_name, shaded))
+        sections.append(error_section(errors, origin, moving, reference_name, is_truth, shaded))
     if estimate is not None and mag is not None and len(mag):
         sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
     if raw is not None or estimate is not None:
