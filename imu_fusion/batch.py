@@ -11,7 +11,7 @@ from pathlib import Path
 
 from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
-from imu_fusion.messages import streams
+from imu_fusion.messages import orientation_stream as orientation
 from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
 from imu_fusion.messages.convert import LOGS
 from imu_fusion.messages.layouts import IMU, MAG
@@ -54,11 +54,11 @@ def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
         Stage("orientation_estimator", OrientationParams,
-              required={streams.IMU_TOPIC: IMU.msgtype},
-              optional={streams.MAG_TOPIC: MAG.msgtype},
-              outputs=streams.OrientationStream.outputs,
-              run=streams.orientation_batch,
-              findings=streams.orientation_findings),
+              required={orientation.IMU_TOPIC: IMU.msgtype},
+              optional={orientation.MAG_TOPIC: MAG.msgtype},
+              outputs=orientation.OUTPUTS,
+              run=orientation.run,
+              findings=orientation.findings),
     )}
 
 

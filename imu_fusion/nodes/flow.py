@@ -253,6 +253,11 @@ class FlowSource:
             for t in consumer.acked) or (self._announced and consumer.acked and not consumer.done))
         return "no acknowledgement from " + ", ".join(slow) if slow else ""
 
+    def acknowledged(self, topic):
+        """The number up to which all consumers of ``topic`` have acknowledged; None: nobody."""
+        return min((c.position(topic) for c in self._consumers.values() if topic in c.acked),
+                   default=None)
+
     def report(self):
         """{topic: (messages sent, {consumer: messages it lost})} of our consumers."""
         return {topic: (publisher.sent, {
@@ -339,9 +344,8 @@ class FlowSource:
                 return
             self._settling = False
         for topic, publisher in self._publishers.items():
-            positions = [c.position(topic) for c in self._consumers.values()
-                         if topic in c.acked]
-            publisher.limit = min(positions) + self._window if positions else _UNBOUNDED
+            position = self.acknowledged(topic)
+            publisher.limit = _UNBOUNDED if position is None else position + self._window
             publisher.drain()
         self._announce_end()
         if self._announced and self.drained():

@@ -5,7 +5,7 @@ import sys
 import time
 from dataclasses import dataclass
 
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -76,13 +76,13 @@ class Replayer(Node):
         self._source = FlowSource(self, wait_for=p.wait_for_nodes)
         self._outputs = self._make_publishers(p)
         self._clock_out = self.create_publisher(
-            Clock, "/clock", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        ) if p.clock else None
+            Clock, "/clock", reliable_qos(10)) if p.clock else None
         self._next_clock = 0
         self._messages = iter(())
         self._next = None  # (topic, log time, bytes) that is due next
         self._phase = self._wait
         self._waiting_since = time.monotonic()
+        self._last_event = None
         self._deadline = None  # of an end that was asked for
         self._paused = p.start_paused
         self._steps = 0
@@ -99,16 +99,18 @@ class Replayer(Node):
 
     def work(self):
         """Do what the present phase asks for; see :meth:`Node.work`."""
+        if self._deadline is not None and time.monotonic() > self._deadline:
+            self.finished = True
         return self._phase()
 
     def stop(self):
         """End the session, so that whoever listens knows; wait for that only briefly."""
         self._deadline = time.monotonic() + 2.0
-        if self._source.session is None:
+        self._next = None
+        if self._phase == self._wait:
             self.finished = True
-        else:
-            self._source.end(END)
-            self._phase = self._drain
+        elif self._phase != self._drain:
+            self._end(END)
 
     def close(self):
         """Close the recording and say what was sent to whom."""
@@ -157,8 +159,10 @@ class Replayer(Node):
         return _BLOCKED
 
     def _begin(self):
-        self._messages = self._bag.messages(list(self._outputs), self._start, self._stop)
-        self._advance()
+        # Asked to end after NEXT has been promised: the next session is empty.
+        if self._deadline is None:
+            self._messages = self._bag.messages(list(self._outputs), self._start, self._stop)
+            self._advance()
         self._source.begin()
         self._anchor = None
         self._next_clock = 0
@@ -178,9 +182,8 @@ class Replayer(Node):
     def _play(self):
         for _ in range(_BURST):
             if self._next is None:
-                again = self.params(ReplayerParams).loop
-                self._source.end(NEXT if again else END)
-                self._phase = self._drain
+                again = self.params(ReplayerParams).loop and self._deadline is None
+                self._end(NEXT if again else END)
                 return 0.0
             if self._paused and not self._steps:
                 self._anchor = None
@@ -202,15 +205,18 @@ class Replayer(Node):
 
     def _drain(self):
         """Everything is sent; our nodes say when they have it."""
-        if self._deadline is not None and time.monotonic() > self._deadline:
-            self.finished = True
         if not self._source.drained():
             return _BLOCKED
-        if self._deadline is None and self.params(ReplayerParams).loop:
+        if self._last_event == NEXT:
             self._begin()
         else:
             self.finished = True
         return 0.0
+
+    def _end(self, event):
+        self._last_event = event
+        self._source.end(event)
+        self._phase = self._drain
 
     def _advance(self):
         item = next(self._messages, None)

@@ -37,6 +37,10 @@ class Graph:
             Parameter(name.replace("__", "."), value=value)
             for name, value in parameters.items()]))
 
+    def close(self, node):
+        node.close()
+        self.remove(node)
+
     def remove(self, node):
         self.executor.remove_node(node)
         self.nodes.remove(node)

@@ -13,7 +13,7 @@ from imu_fusion.errors import ParameterError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.messages.layouts import IMU, LAYOUTS, MAG
-from imu_fusion.messages.streams import OrientationStream
+from imu_fusion.messages.orientation_stream import OUTPUTS as TYPES
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
@@ -57,7 +57,7 @@ def write(path, imu, mag, faults=True):
 
 def fields(topic, cdr):
     """All decoded fields of a message, as bytes so that NaN equals itself."""
-    msgtype = OrientationStream.outputs[topic.lstrip("/")]
+    msgtype = TYPES[topic.lstrip("/")]
     if msgtype not in LAYOUTS:
         return bytes(cdr[4:5])
     stamp, frame_id, values = LAYOUTS[msgtype].decode(cdr)

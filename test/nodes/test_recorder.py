@@ -25,7 +25,7 @@ def test_replay_recorded_is_the_recording(graph, bag, tmp_path):
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0,
                            wait_for_nodes=["recorder"])
     graph.until(lambda: recorder.finished and replayer.finished)
-    recorder.close()
+    graph.close(recorder)
     assert contents(out) == contents(bag)
     assert (out / "metadata.yaml").exists() and (out / "out_0.mcap").exists()
     with open_bag(out) as reader:
@@ -38,7 +38,7 @@ def test_long_replay_loses_nothing(graph, tmp_path):
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0,
                            wait_for_nodes=["recorder"])
     graph.until(lambda: recorder.finished and replayer.finished)
-    recorder.close()
+    graph.close(recorder)
     result, expected = contents(tmp_path / "out"), contents(bag)
     assert {k: result[k] for k in expected} == expected
 
@@ -49,7 +49,7 @@ def test_receive_time_and_send_time_are_kept_apart(graph, bag, tmp_path):
     graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0,
                 wait_for_nodes=["recorder"])
     graph.until(lambda: recorder.finished)
-    recorder.close()
+    graph.close(recorder)
     with open(tmp_path / "out" / "out_0.mcap", "rb") as stream:
         rows = [m for _, _, m in mcap.reader.make_reader(stream).iter_messages()]
     assert len(rows) == 200 and [m.sequence for m in rows] == list(range(200))
@@ -70,7 +70,7 @@ def test_topics_that_appear_later_and_live_data_until_stopped(graph, tmp_path):
     graph.until(lambda: recorder._writer.counts["/a1"] == 5 and recorder._writer.counts["/a2"])
     recorder.stop()
     assert recorder.finished
-    recorder.close()
+    graph.close(recorder)
     found = contents(tmp_path / "out")
     assert {k: len(v) for k, v in found.items()} == {"/a1": 5, "/a2": 1}
 
@@ -88,7 +88,7 @@ def test_best_effort_and_latched_publishers_are_heard(graph, tmp_path):
     lax.publish(Int64(data=8))
     counts = recorder._writer.counts
     graph.until(lambda: counts["/lax"] == 1 and counts["/latched"] == 1)
-    recorder.close()
+    graph.close(recorder)
     with open_bag(tmp_path / "out") as reader:
         assert reader.topics["/lax"].qos_profiles[0]["reliability"] == "best_effort"
         assert reader.topics["/latched"].qos_profiles[0]["durability"] == "transient_local"
@@ -97,7 +97,7 @@ def test_best_effort_and_latched_publishers_are_heard(graph, tmp_path):
 def test_named_topic_that_never_appeared_is_said(graph, tmp_path, capsys):
     recorder = graph.start(Recorder, out=str(tmp_path / "out"), topics=["imu/data"])
     recorder.stop()
-    recorder.close()
+    graph.close(recorder)
     assert "/imu/data: never appeared" in capsys.readouterr().err
 
 
@@ -108,7 +108,7 @@ def test_loop_is_recorded_until_its_end(graph, bag, tmp_path):
     graph.until(lambda: recorder._writer.counts["/imu/data_raw"] > 300)
     replayer.stop()
     graph.until(lambda: recorder.finished and replayer.finished)
-    recorder.close()
+    graph.close(recorder)
     assert len(contents(tmp_path / "out")["/imu/data_raw"]) > 300
 
 
@@ -128,7 +128,7 @@ def test_disk_full_is_said_and_what_was_written_stays(graph, tmp_path):
         pub.publish(Imu())
     with pytest.raises(BagError, match="No space left on device"):
         graph.until(lambda: recorder._writer.counts["/imu/data_raw"] == 60)
-    recorder.close()
+    graph.close(recorder)
     assert len(contents(tmp_path / "out")["/imu/data_raw"]) >= 10
 
 

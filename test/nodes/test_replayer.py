@@ -149,7 +149,7 @@ def test_waits_for_subscribers_and_gives_up_with_a_reason(graph, bag):
 def test_without_subscribers_when_none_are_asked_for(graph, bag, capsys):
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0)
     graph.until(lambda: replayer.finished)
-    replayer.close()
+    graph.close(replayer)
     assert "/imu/data_raw: 200 messages to nobody" in capsys.readouterr().err
 
 
