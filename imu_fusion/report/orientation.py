@@ -47,30 +47,60 @@ def euler_zyx(quat_world_imu, cov_attitude=None):
     return angles, np.minimum(sd, np.pi)
 
 
-def orientation_section(stamp, quat_world_imu, cov_attitude, origin, reference=None,
-                        reference_name="reference", shaded=()):
-    """Section with roll, pitch and yaw of an estimate beside a reference.
+def angle_panels(estimate, origin, reference=None, reference_name="reference"):
+    """Panels of roll, pitch and yaw with their band, beside a reference.
 
     Args:
-        stamp: (n,) int64 ns; quat_world_imu: (n, 4) xyzw; cov_attitude: (n, 3, 3) or None.
+        estimate: AttitudeLog.
         origin: int ns, zero of the time axis.
         reference: PoseLog or None.
-        shaded: [(start, end)] s in movement.
     """
-    time = seconds(stamp, origin)
-    angles, sd = (np.degrees(a) for a in euler_zyx(quat_world_imu, cov_attitude))
-    if reference is not None and len(reference):
+    time = seconds(estimate.stamp, origin)
+    angles, sd = (np.degrees(a) for a in euler_zyx(estimate.quat_world_imu,
+                                                   estimate.cov_attitude))
+    has_reference = reference is not None and len(reference) > 0
+    if has_reference:
         known = np.isfinite(reference.quat_world_imu).all(axis=1)
         ref_time = seconds(reference.stamp[known], origin)
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
     panels = []
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i])]
-        items.append(Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE))
-        if reference is not None and len(reference):
+        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i]),
+                 Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE)]
+        if has_reference:
             items.append(Line(reference_name, ref_time, fig.break_wraps(ref_angles[:, i]),
                               fig.REFERENCE, dash="dot", width=1.2))
         panels.append(Panel(f"{name} in °", tuple(items)))
+    return panels
+
+
+def error_panels(errors, origin, word="error"):
+    """Panels of the error rotation in world axes with the stated standard deviations.
+
+    Args:
+        errors: OrientationErrors.
+        origin: int ns, zero of the time axis.
+        word: what it is called in the legend.
+    """
+    time = seconds(errors.stamp, origin)
+    panels = []
+    for i, name in enumerate(("tilt about east", "tilt about north", "heading")):
+        sd = np.degrees(errors.sd_world[:, i])
+        panels.append(Panel(f"{name} in °", (
+            Band("±3σ stated", time, -3 * sd, 3 * sd, opacity=0.18),
+            Band("±1σ stated", time, -sd, sd, opacity=0.38),
+            Line(word, time, np.degrees(errors.rotation_world[:, i]), fig.ESTIMATE))))
+    return panels
+
+
+def orientation_section(estimate, origin, reference=None, reference_name="reference", shaded=()):
+    """Section with roll, pitch and yaw of an estimate beside a reference.
+
+    Args:
+        estimate, origin, reference: see :func:`angle_panels`.
+        shaded: [(start, end)] s in movement.
+    """
+    panels = angle_panels(estimate, origin, reference, reference_name)
     return Section("Orientation", (
         Figure(time_figure(panels, shaded, _MOVING),
                "Roll, pitch and yaw of the sensor in east-north-up (REP 103: yaw counter-clockwise "
@@ -99,20 +129,14 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
                          number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count))
     table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
-                  f"{word.capitalize()} against {reference_name}. The {word} rotation (estimate times inverse "
-                  "reference, in the world) is split as in BROAD (Laidig et al. 2021) into a "
-                  "heading part about the vertical and an inclination part about a horizontal "
-                  "axis.")
+                  f"{word.capitalize()} against {reference_name}. The {word} rotation (estimate "
+                  "times inverse reference, in the world) is split as in BROAD (Laidig et al. "
+                  "2021) into a heading part about the vertical and an inclination part about a "
+                  "horizontal axis.")
     blocks = [table]
     if is_truth:
         blocks += _honesty(errors, moving)
-    panels = []
-    for i, name in enumerate(("tilt about east", "tilt about north", "heading")):
-        sd = np.degrees(errors.sd_world[:, i])
-        panels.append(Panel(f"{name} in °", (
-            Band("±3σ stated", time, -3 * sd, 3 * sd, opacity=0.18),
-            Band("±1σ stated", time, -sd, sd, opacity=0.38),
-            Line(word, time, np.degrees(errors.rotation_world[:, i]), fig.ESTIMATE))))
+    panels = error_panels(errors, origin, word)
     blocks.append(Figure(
         time_figure(panels, shaded, _MOVING),
         f"The {word} rotation in the axes of the world with the standard deviations that the "

@@ -42,7 +42,7 @@ def write_orientation_report(bag, estimates, path):
                 ((RAW, IMU.msgtype), (MAGNETOMETER, MAG.msgtype)) if _has(reader, name, msgtype)}
         reference_name = _reference(reader)
         reference = read_log(reader, reference_name) if reference_name else None
-        changes = _moving(reader)
+        changes = moving_changes(reader)
         warnings = list(reader.warnings)
         start = reader.start_time
         duration = (reader.end_time - start) * 1e-9
@@ -81,9 +81,8 @@ def write_orientation_report(bag, estimates, path):
                                           "too: what follows are differences, not errors.")))
     sections = [Section("Summary", tuple(blocks)), overview_section(topics, origin)]
     if estimate is not None:
-        sections.append(orientation_section(
-            estimate.stamp, estimate.quat_world_imu, estimate.cov_attitude, origin, reference,
-            reference_name or "", shaded))
+        sections.append(orientation_section(estimate, origin, reference, reference_name or "",
+                                            shaded))
     if errors is not None:
         sections.append(error_section(errors, origin, moving, reference_name, is_truth, shaded))
     if estimate is not None and mag is not None and len(mag):
@@ -129,7 +128,7 @@ def _reference(reader):
     return poses[0] if poses else None
 
 
-def _moving(reader):
+def moving_changes(reader):
     """(stamps, values) of the movement mask's changes, or None."""
     if not _has(reader, MOVING, BOOL_TYPE):
         return None
