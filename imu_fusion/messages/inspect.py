@@ -48,12 +48,15 @@ class TopicReport:
     @property
     def rate(self):
         """Mean rate in Hz, None with fewer than two stamps or without a header."""
-        return None if not self.stamped or np.isnan(self.timing.rate_hz) else self.timing.rate_hz
+        return self._or_none(self.timing.rate_hz)
 
     @property
     def longest_gap(self):
         """Longest interval in s, None with fewer than two stamps or without a header."""
-        return None if not self.stamped or np.isnan(self.timing.longest_gap_s) else self.timing.longest_gap_s
+        return self._or_none(self.timing.longest_gap_s)
+
+    def _or_none(self, value):
+        return None if not self.stamped or np.isnan(value) else value
 
     @property
     def notes(self):

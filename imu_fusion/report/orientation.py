@@ -152,8 +152,8 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
             from_zero=True))
     blocks.append(Figure(
         time_figure(panels, shaded, _MOVING, panel_height=160),
-        f"The {word} angles of the table; σ is the root of the sum of the variances involved, that "
-        "is the RMS that the estimator expected."))
+        f"The {word} angles of the table; σ is the root of the sum of the variances involved, "
+        "that is the RMS that the estimator expected."))
     return Section("Error against the reference" if is_truth
                    else f"Difference from {reference_name}", tuple(blocks))
 

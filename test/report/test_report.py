@@ -109,7 +109,7 @@ def test_a_report_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_the_report_of_a_real_recording_is_complete_and_bounded(tmp_path):
-    """Without estimates it is about the recording; the flight's autopilot is named as what it is."""
+    """Without estimates it is about the recording."""
     out = tmp_path / "report.html"
     write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
     page = Page(out.read_text())
