@@ -200,8 +200,19 @@ def right_jacobian(phi):
     else:
         b = (1.0 - math.cos(angle)) / angle2
         c = (angle - math.sin(angle)) / (angle2 * angle)
-    k = skew(phi)
-    return np.eye(3) - b * k + c * (k @ k)
+    # [phi]x squared is phi phi' - angle^2 I.
+    j = np.empty((3, 3))
+    for i in range(3):
+        for m in range(3):
+            j[i, m] = c * phi[i] * phi[m]
+        j[i, i] += 1.0 - c * angle2
+    j[0, 1] += b * phi[2]
+    j[0, 2] -= b * phi[1]
+    j[1, 0] -= b * phi[2]
+    j[1, 2] += b * phi[0]
+    j[2, 0] += b * phi[1]
+    j[2, 1] -= b * phi[0]
+    return j
 
 
 @njit(cache=True)
