@@ -168,6 +168,7 @@ def attitude_log(messages):
         raise TopicError("these sensor_msgs/Imu carry no orientation (covariance[0] is -1): they "
                          "are raw data, not estimates")
     quat = values[:, IMU["orientation"]]
+    quat[np.linalg.norm(quat, axis=1) < 0.5] = np.nan  # zeros: a source that left them unset
     rotation = Rotation.from_quat(quat).as_matrix() if len(quat) else np.empty((0, 3, 3))
     samples = imu_values(values)
     return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,

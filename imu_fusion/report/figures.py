@@ -23,7 +23,7 @@ HIGHLIGHT = "#D55E00"
 SECONDARY = "#CC79A7"
 NEUTRAL = "#7b8794"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7b8794")
-_INK, _GRID = "#39444f", "#e8ecf1"
+_INK, _GRID, _AXIS = "#39444f", "#e8ecf1", "#c5ced8"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,21 +95,28 @@ def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
                                   bgcolor="rgba(255,255,255,0.75)")
     if len(shaded):
         _shade(figure, shaded, shaded_name)
+    style(figure, height=int(95 + panel_height * len(panels)))
     figure.update_layout(
-        height=int(95 + panel_height * len(panels)),
-        margin=dict(l=84, r=18, t=52, b=48), template="none", hovermode="x unified",
-        font=dict(family="system-ui, Segoe UI, Roboto, Helvetica, Arial, sans-serif", size=13,
-                  color=_INK),
+        hovermode="x unified", hoverlabel=dict(font=dict(size=12)),
         legend=dict(orientation="h", x=0, xanchor="left", y=1, yref="container", yanchor="top",
-                    font=dict(size=13), itemsizing="constant"),
-        hoverlabel=dict(font=dict(size=12)))
-    figure.update_xaxes(gridcolor=_GRID, zeroline=False, linecolor="#c5ced8", showline=True,
-                        ticks="outside", tickcolor="#c5ced8", hoverformat=".3f", matches="x")
-    figure.update_yaxes(gridcolor=_GRID, zerolinecolor="#c5ced8", zerolinewidth=1,
-                        linecolor="#c5ced8", showline=True, nticks=6)
+                    font=dict(size=13), itemsizing="constant"))
+    figure.update_xaxes(zeroline=False, hoverformat=".3f", matches="x")
+    figure.update_yaxes(nticks=6)
     figure.update_xaxes(title=dict(text="time since start in s", font=dict(size=13), standoff=6),
                         row=len(panels), col=1)
     return figure
+
+
+def style(figure, height):
+    """Fonts, margins, grid and axes that all figures share. height: pixels."""
+    figure.update_layout(
+        height=height, margin=dict(l=84, r=18, t=52, b=48), template="none",
+        font=dict(family="system-ui, Segoe UI, Roboto, Helvetica, Arial, sans-serif", size=13,
+                  color=_INK))
+    line = dict(gridcolor=_GRID, linecolor=_AXIS, showline=True, zerolinecolor=_AXIS,
+                zerolinewidth=1, title_font=dict(size=13))
+    figure.update_xaxes(ticks="outside", tickcolor=_AXIS, **line)
+    figure.update_yaxes(**line)
 
 
 def intervals(time, mask):

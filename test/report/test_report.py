@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.errors import ImuFusionError, TopicError
 from imu_fusion.messages.bag import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message, pose_message
 from imu_fusion.report.figures import Line, Panel, break_wraps, intervals, time_figure
+from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import (
     Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
 from imu_fusion.report.orientation import euler_zyx
 from imu_fusion.report.recording import write_orientation_report
+from imu_fusion.samples import FixLog, VelocityLog
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 START = 1_700_000_000_000_000_000
@@ -116,7 +118,7 @@ def test_the_report_of_a_real_recording_is_complete_and_bounded(tmp_path):
     assert "holds no estimates" in page.text and "/onboard_ekf/pose" in page.text
     assert "13656" in page.text and "136.55" in page.text and "214 gaps" in page.text
     headings = re.findall(r"<h2>(.*?)</h2>", out.read_text())
-    assert headings == ["Summary", "The recording", "Angular rates and specific force"]
+    assert headings == ["Summary", "The recording", "Angular rates and specific force", "GNSS"]
     assert out.stat().st_size < 8e6
 
 
@@ -166,3 +168,50 @@ def test_stretches_and_wraps():
     assert intervals(np.arange(2.0), np.zeros(2, bool)) == []
     np.testing.assert_array_equal(np.isnan(break_wraps([170, 179, -179, -170])),
                                   [False, False, True, False])
+
+
+def test_damaged_samples_are_left_out_and_told(tmp_path):
+    """Zero quaternions, NaN, repeated and backward stamps do not stop a report."""
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(300):
+            stamp = START + (i if i != 50 else 49) * 10_000_000
+            quat = [0, 0, 0, 0] if i == 10 else [0, 0, 0, 1]
+            acc = [np.nan if i == 20 else 0.0, 0.0, 9.81] + rng.normal(0, 0.05, 3)
+            writer.write("/imu/data_raw", "sensor_msgs/msg/Imu",
+                         imu_message(stamp, "i", [0, 0, 0], acc), START + i * 10_000_000)
+            writer.write("/imu/data", "sensor_msgs/msg/Imu",
+                         imu_message(stamp, "i", [0, 0, 0], acc, quat, np.eye(3) * 1e-4),
+                         START + i * 10_000_000)
+            writer.write("/reference/pose", "geometry_msgs/msg/PoseStamped",
+                         pose_message(stamp, "world", quat), START + i * 10_000_000)
+    out = tmp_path / "report.html"
+    write_orientation_report(tmp_path / "bag", tmp_path / "bag", out)
+    text = Page(out.read_text()).text
+    assert "reference/pose: 1 orientations are zero" in text
+    assert "1 samples left out: repeated stamp" in text
+    assert "not finite" in text
+
+
+def test_a_recording_without_messages_is_told(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/imu/data_raw", "sensor_msgs/msg/Imu")
+    with pytest.raises(TopicError, match="no messages"):
+        write_orientation_report(tmp_path / "bag", tmp_path / "bag", tmp_path / "r.html")
+
+
+def test_gnss_track_has_the_true_extent():
+    """0.001 deg of latitude are 111.19 m on a meridian near 47 deg (WGS84: 111.18 m)."""
+    n = 11
+    fix = FixLog(np.arange(n) * 10 ** 9, 47 + np.linspace(0, 1e-3, n), np.full(n, 8.0),
+                 np.linspace(400, 410, n), np.tile(np.eye(3) * 4.0, (n, 1, 1)),
+                 np.r_[np.zeros(n - 1), -1])
+    velocity = VelocityLog(fix.stamp, np.tile([3.0, 4.0, 1.0], (n, 1)), np.zeros((n, 3, 3)))
+    section = gnss_section(fix, velocity, 0)
+    cells = {row[0]: row[1] for row in section.blocks[0].rows}
+    # The last one has no fix: nine tenths of the way.
+    assert float(cells["extent north"]) == pytest.approx(0.9 * 111.18, abs=0.1)
+    assert float(cells["extent east"]) == 0.0
+    assert float(cells["greatest horizontal speed"]) == 5.0
+    assert "2.000 / 2.000 / 2.000" in cells["median stated σ east, north, up"]
+    assert "No message" in gnss_section(fix[-1:], None, 0).blocks[0].text
