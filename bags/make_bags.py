@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import (
-    fix_message, imu_message, mag_message, pose_message, velocity_message)
+    bool_message, fix_message, imu_message, mag_message, pose_message, velocity_message)
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 
 HERE = Path(__file__).resolve().parent
 IMU_FRAME = "imu_link"
@@ -29,13 +30,6 @@ WORLD_FRAME = "world"
 
 # BROAD gives a sampling rate and no stamps; its recordings start at this arbitrary instant.
 BROAD_EPOCH = 1_600_000_000_000_000_000
-
-IMU_TYPE = "sensor_msgs/msg/Imu"
-MAG_TYPE = "sensor_msgs/msg/MagneticField"
-FIX_TYPE = "sensor_msgs/msg/NavSatFix"
-VELOCITY_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
-POSE_TYPE = "geometry_msgs/msg/PoseStamped"
-BOOL_TYPE = "std_msgs/msg/Bool"
 
 # sensor_msgs/NavSatStatus
 STATUS_FIX, STATUS_GBAS_FIX = 0, 2
@@ -56,11 +50,6 @@ class Recording:
     attribution: str
     sources: tuple
     make: object
-
-
-def bool_message(value):
-    """CDR bytes of a std_msgs/Bool."""
-    return b"\x00\x01\x00\x00" + bytes([bool(value)])
 
 
 def read_broad(path):
@@ -88,11 +77,11 @@ def broad(trial):
         seen = np.isfinite(quat).all(axis=1)
         moving = data["mov"].astype(bool)
         change = np.flatnonzero(np.r_[True, moving[1:] != moving[:-1]])
-        yield "imu/data_raw", IMU_TYPE, [
+        yield "imu/data_raw", IMU.msgtype, [
             (t, imu_message(t, IMU_FRAME, gyr, acc))
             for t, gyr, acc in zip(stamp, data["gyr"].astype(float), data["acc"].astype(float))]
-        yield "imu/mag", MAG_TYPE, [(t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
-        yield "reference/pose", POSE_TYPE, [
+        yield "imu/mag", MAG.msgtype, [(t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
+        yield "reference/pose", POSE.msgtype, [
             (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp[seen], quat[seen])]
         yield "reference/moving", BOOL_TYPE, [
             (t, bool_message(m)) for t, m in zip(stamp[change], moving[change])]
@@ -128,17 +117,17 @@ def px4_plane(source):
     """Topics of the flight; the autopilot's own attitude is an estimate, not a reference."""
     folder = source / "px4_plane"
     stamp, imu = read_csv(folder / "imu.csv")
-    yield "imu/data_raw", IMU_TYPE, imu_rows(stamp, imu)
-    yield "imu/mag", MAG_TYPE, [(t, mag_message(t, IMU_FRAME, m)) for t, m in
+    yield "imu/data_raw", IMU.msgtype, imu_rows(stamp, imu)
+    yield "imu/mag", MAG.msgtype, [(t, mag_message(t, IMU_FRAME, m)) for t, m in
                                 zip(stamp, columns(imu, "mag_x", "mag_y", "mag_z"))]
     stamp, gnss = read_csv(folder / "gnss.csv")
-    yield "fix", FIX_TYPE, [
+    yield "fix", FIX.msgtype, [
         (t, fix_message(t, GNSS_FRAME, *position, status=STATUS_FIX))
         for t, position in zip(stamp, columns(gnss, "lat_deg", "lon_deg", "height_m"))]
-    yield "fix_velocity", VELOCITY_TYPE, velocity_rows(stamp, gnss)
+    yield "fix_velocity", TWIST.msgtype, velocity_rows(stamp, gnss)
     stamp, attitude = read_csv(folder / "onboard_attitude.csv")
     quat = enu_flu_from_euler(columns(attitude, "yaw_deg", "pitch_deg", "roll_deg"))
-    yield "onboard_ekf/pose", POSE_TYPE, [
+    yield "onboard_ekf/pose", POSE.msgtype, [
         (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp, quat)]
 
 
@@ -157,15 +146,15 @@ def drive(source):
     """Topics of the drive: the RTK positions with their stated standard deviations."""
     folder = source / "drive_0708"
     stamp, imu = read_csv(folder / "imu.csv")
-    yield "imu/data_raw", IMU_TYPE, imu_rows(stamp, imu)
+    yield "imu/data_raw", IMU.msgtype, imu_rows(stamp, imu)
     stamp, gnss = read_csv(folder / "gnss.csv")
     position = columns(gnss, "lat_deg", "lon_deg", "height_m")
     sd_enu = columns(gnss, "sd_e", "sd_n", "sd_u")
     status = np.where(gnss["quality"] == 1, STATUS_GBAS_FIX, STATUS_FIX)
-    yield "fix", FIX_TYPE, [
+    yield "fix", FIX.msgtype, [
         (t, fix_message(t, GNSS_FRAME, *p, cov_enu=np.diag(sd ** 2), status=s))
         for t, p, sd, s in zip(stamp, position, sd_enu, status)]
-    yield "fix_velocity", VELOCITY_TYPE, velocity_rows(stamp, gnss)
+    yield "fix_velocity", TWIST.msgtype, velocity_rows(stamp, gnss)
 
 
 def _broad(name, trial, title):
