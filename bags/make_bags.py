@@ -80,7 +80,8 @@ def broad(trial):
         yield "imu/data_raw", IMU.msgtype, [
             (t, imu_message(t, IMU_FRAME, gyr, acc))
             for t, gyr, acc in zip(stamp, data["gyr"].astype(float), data["acc"].astype(float))]
-        yield "imu/mag", MAG.msgtype, [(t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
+        yield "imu/mag", MAG.msgtype, [
+            (t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
         yield "reference/pose", POSE.msgtype, [
             (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp[seen], quat[seen])]
         yield "reference/moving", BOOL_TYPE, [
