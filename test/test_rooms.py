@@ -13,7 +13,7 @@ PACKAGE = Path(imu_fusion.__file__).parent
 PURE = ("samples", "geometry", "sensors", "surfaces", "estimation")
 # What no pure room may import: ROS, files and the system, plots, clocks, the command line.
 FORBIDDEN = {"rclpy", "rosbags", "mcap", "plotly", "matplotlib", "yaml", "pathlib", "os", "io",
-             "time", "datetime", "subprocess", "socket", "click", "rich", "logging",
+             "time", "subprocess", "socket", "click", "rich", "logging",
              "sensor_msgs", "geometry_msgs", "nav_msgs", "std_msgs", "std_srvs",
              "diagnostic_msgs"}
 # Rooms from the bottom up; a room imports only from rooms of a lower number.
@@ -52,6 +52,15 @@ def test_imports_go_one_way(file):
         if parts[0] == "imu_fusion" and len(parts) > 1 and parts[1] in FLOOR:
             assert parts[1] == room or FLOOR[parts[1]] <= FLOOR[room], \
                 f"{file.name} ({room}) imports {name}"
+
+
+@pytest.mark.parametrize("room", PURE)
+def test_pure_rooms_ask_no_clock(room):
+    """datetime is welcome for the calendar, not for the present."""
+    for file in (PACKAGE / room).rglob("*.py"):
+        asked = {node.attr for node in ast.walk(ast.parse(file.read_text()))
+                 if isinstance(node, ast.Attribute)} & {"now", "utcnow", "today"}
+        assert not asked, f"{file}: {asked}"
 
 
 def test_the_package_itself_imports_nothing_heavy():

@@ -521,7 +521,9 @@ class FlowSink:
             last = 0 if sequence is None else sequence - 1
         if sequence is None:  # this middleware does not number: count
             sequence = last + 1
-        if sequence > last + 1:
+        session = inbox.session
+        # Without a session there may be several writers, each with numbers of its own.
+        if sequence > last + 1 and session is not None:
             if inbox.received:
                 inbox.lost += sequence - last - 1
             else:
@@ -529,7 +531,6 @@ class FlowSink:
         inbox.last = sequence  # not above the last one: another writer, counted from there
         inbox.received += 1
         inbox.callback(cdr, info)
-        session = inbox.session
         if session is None or not session.is_open:
             return
         inbox.unacknowledged += 1
