@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -215,3 +217,23 @@ def test_gnss_track_has_the_true_extent():
     assert float(cells["greatest horizontal speed"]) == 5.0
     assert "2.000 / 2.000 / 2.000" in cells["median stated σ east, north, up"]
     assert "No message" in gnss_section(fix[-1:], None, 0).blocks[0].text
+
+
+@pytest.mark.slow
+def test_a_real_browser_draws_every_figure_offline(tmp_path):
+    browser = next((p for p in map(shutil.which, ("chromium", "chromium-browser")) if p), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    out = tmp_path / "report.html"
+    write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    drawn = subprocess.run(
+        [browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+         "--disable-background-networking", "--disable-component-update", "--disable-sync",
+         "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'user'}",
+         "--virtual-time-budget=20000", "--dump-dom", out.as_uri()],
+        check=True, capture_output=True, text=True, timeout=120).stdout
+    figures = len(Page(out.read_text()).figures)
+    assert figures == 4
+    # plotly marks every element that it has drawn into, and puts one layer of axes there.
+    assert len(re.findall(r'<div class="plot[^>]*js-plotly-plot', drawn)) == figures
+    assert drawn.count('class="cartesianlayer"') == figures
