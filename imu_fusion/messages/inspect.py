@@ -27,7 +27,7 @@ class Range:
 class TopicReport:
     """One topic: ``stamp`` (n,) int64 ns of its headers (log times, if it is not ``stamped``
     because its messages have no header) and their ``timing``, ``ranges`` of what it measures,
-    ``findings`` about it."""
+    ``findings`` about it, and its ``log`` if there is one for its type."""
 
     topic: str
     msgtype: str
@@ -35,6 +35,7 @@ class TopicReport:
     ranges: tuple = ()
     findings: tuple = ()
     stamped: bool = True
+    log: object = field(default=None, repr=False, compare=False)
     timing: checks.Timing = field(init=False)
 
     def __post_init__(self):
@@ -73,20 +74,19 @@ def inspect_topics(reader):
     Returns:
         list of TopicReport, in order of their names.
     """
-    logs, reports = {}, []
+    reports = []
     for name, info in sorted(reader.topics.items()):
         if info.msgtype in LOGS and info.count:
             try:
-                logs[name] = read_log(reader, name)
+                report = inspect_log(name, info.msgtype, read_log(reader, name))
             except MessageError as error:
-                reports.append(TopicReport(name, info.msgtype, np.empty(0, np.int64), (), (
-                    checks.Finding("type", f"{name}: {error}"),)))
-                continue
-            report = inspect_log(name, info.msgtype, logs[name])
+                report = TopicReport(name, info.msgtype, np.empty(0, np.int64), (), (
+                    checks.Finding("type", f"{name}: {error}"),))
         else:
             report = _inspect_stamps(reader, name, info)
         reports.append(report)
-    return [_with_axes(report, logs) for report in reports]
+    imus = [report.log for report in reports if isinstance(report.log, ImuLog)]
+    return [_with_axes(report, imus) for report in reports]
 
 
 def inspect_log(name, msgtype, log):
@@ -113,17 +113,15 @@ def inspect_log(name, msgtype, log):
         if isinstance(log, PoseLog):
             findings += checks.check_finite(log.quat_world_imu, name, "orientation")
     return TopicReport(name, msgtype, log.stamp, (r for r in ranges if r is not None),
-                       tuple(findings))
+                       tuple(findings), log=log)
 
 
-def _with_axes(report, logs):
+def _with_axes(report, imus):
     """Add how a magnetometer turns against the only Imu of the recording."""
-    imus = [log for log in logs.values() if isinstance(log, ImuLog)]
-    log = logs.get(report.topic)
-    if not isinstance(log, MagLog) or len(imus) != 1:
+    if not isinstance(report.log, MagLog) or len(imus) != 1:
         return report
     return replace(report, findings=(*report.findings,
-                                     *checks.check_axes(imus[0], log, report.topic)))
+                                     *checks.check_axes(imus[0], report.log, report.topic)))
 
 
 def _inspect_stamps(reader, name, info):

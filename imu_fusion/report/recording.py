@@ -54,14 +54,15 @@ def read_contents(path):
         topics = inspect_topics(reader)
         if not any(t.count for t in topics):
             raise TopicError(f"{path}: no messages to report about")
-        reference_name = _reference(reader)
+        found = {t.topic.lstrip("/"): t for t in topics if t.log is not None and t.count}
+        poses = [name for name, t in found.items() if t.msgtype == POSE.msgtype]
+        reference_name = REFERENCE if REFERENCE in poses else next(iter(poses), None)
         wanted = {RAW: IMU, MAGNETOMETER: MAG, FIX_TOPIC: FIX, VELOCITY_TOPIC: TWIST}
         if reference_name:
             wanted[reference_name] = POSE
-        logs, warnings = {}, list(reader.warnings)
-        for name, layout in wanted.items():
-            if _has(reader, name, layout.msgtype):
-                logs[name] = _usable(read_log(reader, name), name, warnings)
+        warnings = list(reader.warnings)
+        logs = {name: _usable(found[name].log, name, warnings) for name, layout in wanted.items()
+                if name in found and found[name].msgtype == layout.msgtype}
         return Contents(topics, logs, reference_name, moving_changes(reader), tuple(warnings),
                         reader.start_time, (reader.end_time - reader.start_time) * 1e-9)
 
@@ -182,14 +183,6 @@ def _has(reader, topic, msgtype):
     name = find_topic(reader.topics, topic)
     return name is not None and reader.topics[name].msgtype == msgtype \
         and bool(reader.topics[name].count)
-
-
-def _reference(reader):
-    """The topic to compare with: the reference, else the first other pose, else None."""
-    if _has(reader, REFERENCE, POSE.msgtype):
-        return REFERENCE
-    poses = sorted(t.name for t in reader.topics.values() if t.msgtype == POSE.msgtype and t.count)
-    return poses[0] if poses else None
 
 
 def moving_changes(reader):
