@@ -98,8 +98,10 @@ def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
     style(figure, height=int(95 + panel_height * len(panels)))
     figure.update_layout(
         hovermode="x unified", hoverlabel=dict(font=dict(size=12)),
-        legend=dict(orientation="h", x=0, xanchor="left", y=1, yref="container", yanchor="top",
-                    font=dict(size=13), itemsizing="constant"))
+        # Above the panels, at the same distance in pixels however many there are.
+        legend=dict(orientation="h", x=0, xanchor="left", yanchor="bottom",
+                    y=1 + 12 / (panel_height * len(panels) - 5), font=dict(size=13),
+                    itemsizing="constant"))
     figure.update_xaxes(zeroline=False, hoverformat=".3f", matches="x")
     figure.update_yaxes(nticks=6)
     figure.update_xaxes(title=dict(text="time since start in s", font=dict(size=13), standoff=6),

@@ -129,8 +129,8 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
                          number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count))
     table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
-                  f"{word.capitalize()} against {reference_name}. The {word} rotation (estimate "
-                  "times inverse reference, in the world) is split as in BROAD (Laidig et al. "
+                  f"{word.capitalize()}s relative to {reference_name}. The {word} rotation "
+                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig et al. "
                   "2021) into a heading part about the vertical and an inclination part about a "
                   "horizontal axis.")
     blocks = [table]
@@ -204,8 +204,9 @@ def field_section(stamp, mag_world, origin, shaded=()):
         Table(("quantity", "unit", "median", "5 %", "95 %", "standard deviation"), tuple(rows)),
         Figure(time_figure(panels, shaded, _MOVING),
                "What the magnetometer measured, turned into the world by the estimated "
-               "orientation. In an undisturbed field all three stand still; the strength does not "
-               "depend on the orientation, the direction holds its heading error too.")))
+               "orientation. In an undisturbed field all three stand still. The strength does not "
+               "depend on the orientation; inclination and direction do, and an estimator that "
+               "steers by the field keeps them still.")))
 
 
 def motion_section(raw, corrected, origin, shaded=()):
