@@ -41,7 +41,8 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """An area between ``low`` and ``high`` (n,)."""
+    """An area between ``low`` and ``high`` (n,), left out where it is wider than ``widest`` or
+    jumps by more: what wraps around or is not determined has no band."""
 
     name: str
     time: np.ndarray
@@ -49,6 +50,7 @@ class Band:
     high: np.ndarray
     color: str = BAND
     opacity: float = 0.35
+    widest: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -152,13 +154,12 @@ def _traces(item, named):
     named.add(item.name)
     common = dict(name=plain(item.name), legendgroup=item.name, showlegend=first)
     if isinstance(item, Band):
-        time, low, high = envelope(item.time, item.low, item.high)
-        if len(time) == 0:
+        x, y = _outline(*envelope(item.time, item.low, item.high), item.widest)
+        if len(x) == 0:
             return []
         red, green, blue = (int(item.color[i:i + 2], 16) for i in (1, 3, 5))
         return [go.Scatter(
-            x=_compact(np.concatenate([time, time[::-1]])),
-            y=_compact(np.concatenate([high, low[::-1]])), mode="lines", line=dict(width=0),
+            x=_compact(x), y=_compact(y), mode="lines", line=dict(width=0),
             fill="toself", fillcolor=f"rgba({red},{green},{blue},{item.opacity})",
             hoverinfo="skip", **common)]
     time, values = decimate(*break_gaps(item.time, item.values))
@@ -166,6 +167,23 @@ def _traces(item, named):
         x=_compact(time), y=_compact(values), mode="markers" if item.markers else "lines",
         line=dict(color=item.color, width=item.width, dash=item.dash, simplify=False),
         marker=dict(color=item.color, size=4), hovertemplate="%{y:.4g}", **common)]
+
+
+def _outline(time, low, high, widest):
+    """(x, y) of the outlines around a band, one for each stretch, with NaN between them."""
+    keep = high - low <= widest
+    time, low, high = time[keep], low[keep], high[keep]
+    if len(time) < 2:
+        return time[:0], low[:0]
+    step = np.diff(time)
+    jump = np.abs(np.diff(low + high)) / 2
+    breaks = np.flatnonzero((step > 10 * np.median(step)) | (jump > widest)) + 1
+    x, y = [], []
+    for part in np.split(np.arange(len(time)), breaks):
+        back = part[::-1]
+        x += [time[part], time[back], [np.nan]]
+        y += [high[part], low[back], [np.nan]]
+    return np.concatenate(x), np.concatenate(y)
 
 
 def _shade(figure, shaded, name):

@@ -65,7 +65,8 @@ def angle_panels(estimate, origin, reference=None, reference_name="reference"):
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
     panels = []
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i]),
+        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i],
+                      widest=180.0),
                  Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE)]
         if has_reference:
             items.append(Line(reference_name, ref_time, fig.break_wraps(ref_angles[:, i]),
@@ -101,6 +102,16 @@ def orientation_section(estimate, origin, reference=None, reference_name="refere
         shaded: [(start, end)] s in movement.
     """
     panels = angle_panels(estimate, origin, reference, reference_name)
+    cov_world = orientation_error.attitude_cov_world(estimate.quat_world_imu,
+                                                     estimate.cov_attitude)
+    time = seconds(estimate.stamp, origin)
+    variance = np.diagonal(cov_world, axis1=1, axis2=2)
+    stated = [("tilt", np.sqrt(variance[:, 0] + variance[:, 1]), fig.ESTIMATE),
+              ("heading", np.sqrt(variance[:, 2]), fig.HIGHLIGHT)]
+    if np.isfinite(variance).any():
+        panels.append(Panel("σ stated in °", tuple(
+            Line(f"σ of {name}", time, np.degrees(sd), color) for name, sd, color in stated),
+            from_zero=True))
     return Section("Orientation", (
         Figure(time_figure(panels, shaded, _MOVING),
                "Roll, pitch and yaw of the sensor in east-north-up (REP 103: yaw counter-clockwise "

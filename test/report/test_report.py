@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import ImuFusionError, TopicError
 from imu_fusion.messages.bag import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message, pose_message
-from imu_fusion.report.figures import Line, Panel, break_wraps, intervals, time_figure
+from imu_fusion.report.figures import Band, Line, Panel, break_wraps, intervals, time_figure
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import (
     Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
@@ -142,6 +142,20 @@ def test_time_axes_are_one_and_all_panels_are_labelled():
     assert "time" in figure.layout.xaxis2.title.text
     # One legend entry per name, however many panels it is in.
     assert [t.name for t in figure.data if t.showlegend is not False] == ["a", "on"]
+
+
+def test_a_band_breaks_where_it_wraps_or_is_not_determined():
+    time = np.arange(8.0)
+    angle = np.array([170, 175, 179, -178, -174, -170, -166, -162.0])
+    sd = np.array([1, 1, 1, 1, 1, 300, 1, 1.0])
+    figure = time_figure([Panel("yaw", (
+        Band("b", time, angle - sd, angle + sd, widest=180.0),))])
+    y = np.asarray(figure.data[0].y)
+    # Two outlines, of 3 and 4 samples: before the wrap, and after it without the wide one.
+    assert np.isnan(y).sum() == 2
+    assert np.nanmax(np.abs(y)) == 180
+    outlines = np.split(y, np.flatnonzero(np.isnan(y)) + 1)
+    assert all(len(np.unique(np.sign(o[np.isfinite(o)]))) == 1 for o in outlines if len(o) > 1)
 
 
 def test_euler_angles_and_their_standard_deviations():
