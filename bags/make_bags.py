@@ -3,13 +3,15 @@
     python bags/make_bags.py [--source DIR] [--out DIR] [NAME ...]
 
 DIR holds ``broad/``, ``px4_plane/`` and ``drive_0708/`` as README.md describes them;
-``broad/`` may also hold the public ``data_mat/*.mat`` files of dlaidig/broad. Running it
-twice gives the same messages; the bytes of the files also depend on the version of zstd.
+``broad/`` may hold the public ``data_mat/*.mat`` files of dlaidig/broad instead, and
+``drive_0708/`` the files of that name of rtklibexplorer/GNSS_IMU. Running it twice gives the
+same messages; the bytes of the files also depend on the version of zstd.
 """
 
 import argparse
 import hashlib
 import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +32,8 @@ WORLD_FRAME = "world"
 
 # BROAD gives a sampling rate and no stamps; its recordings start at this arbitrary instant.
 BROAD_EPOCH = 1_600_000_000_000_000_000
+
+STANDARD_GRAVITY = 9.80665
 
 # sensor_msgs/NavSatStatus
 STATUS_FIX, STATUS_GBAS_FIX = 0, 2
@@ -143,12 +147,51 @@ def enu_flu_from_euler(yaw_pitch_roll_deg):
     return (ENU_NED * ned_frd * FLU_FRD.inv()).as_quat()
 
 
+def read_public_drive_imu(path):
+    """The drive's IMU from the public log, as :func:`read_csv` gives it from the CSV.
+
+    The log has no times but millisecond ticks; the ``.tag`` file beside it says when it began
+    and ended. The sensor is mounted with x and y backward and right. Its first and last line
+    are incomplete.
+    """
+    tag = path.with_name(path.name + ".tag").read_bytes()
+    whole, fraction = struct.unpack_from("<Id", tag, 64)
+    (duration_ms,) = struct.unpack_from("<I", tag, len(tag) - 8)
+    lines = path.read_text().splitlines()[1:-1]
+    values = np.array([line.split(",") for line in lines], dtype=np.float64)
+    ticks = values[:, 6] - values[0, 6]
+    since = ticks * (duration_ms * 1e-3 / ticks[-1])
+    stamp = whole * 1_000_000_000 + np.round((fraction + since) * 1e6).astype(np.int64) * 1000
+    turned = [-1.0, -1.0, 1.0]
+    acc = np.round(values[:, :3] * turned * STANDARD_GRAVITY, 5)
+    gyr = np.round(np.radians(values[:, 3:6] * turned), 6)
+    return stamp, dict(zip(("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"),
+                           np.hstack([acc, gyr]).T))
+
+
+def read_public_drive_gnss(path):
+    """The drive's GNSS from the public RTKLIB solution, as :func:`read_csv` gives it."""
+    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("%")]
+    stamp = np.array([f"{row[0].replace('/', '-')}T{row[1]}" for row in rows],
+                     dtype="datetime64[ns]").astype(np.int64)
+    values = np.array([row[2:] for row in rows], dtype=np.float64)
+    names = {"lat_deg": 0, "lon_deg": 1, "height_m": 2, "quality": 3, "sd_n": 5, "sd_e": 6,
+             "sd_u": 7, "vel_n": 13, "vel_e": 14, "vel_u": 15}
+    table = {name: values[:, column] for name, column in names.items()}
+    return stamp, {name: np.round(column, 4) if name.startswith("sd_") else column
+                   for name, column in table.items()}
+
+
 def drive(source):
     """Topics of the drive: the RTK positions with their stated standard deviations."""
     folder = source / "drive_0708"
-    stamp, imu = read_csv(folder / "imu.csv")
+    if (folder / "imu.csv").exists():
+        (stamp, imu), gnss = read_csv(folder / "imu.csv"), read_csv(folder / "gnss.csv")
+    else:
+        stamp, imu = read_public_drive_imu(folder / "imu_1934.csv")
+        gnss = read_public_drive_gnss(folder / "gnss_1934_sf.pos")
     yield "imu/data_raw", IMU.msgtype, imu_rows(stamp, imu)
-    stamp, gnss = read_csv(folder / "gnss.csv")
+    stamp, gnss = gnss
     position = columns(gnss, "lat_deg", "lon_deg", "height_m")
     sd_enu = columns(gnss, "sd_e", "sd_n", "sd_u")
     status = np.where(gnss["quality"] == 1, STATUS_GBAS_FIX, STATUS_FIX)

@@ -141,8 +141,8 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
     table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
                   f"{word.capitalize()}s relative to {reference_name}. The {word} rotation "
-                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig et al. "
-                  "2021) into a heading part about the vertical and an inclination part about a "
+                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig et "
+                  "al. 2021) into a heading part about the vertical and an inclination part about a "
                   "horizontal axis.")
     blocks = [table]
     if is_truth:
