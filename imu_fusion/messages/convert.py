@@ -191,7 +191,12 @@ def attitude_log(messages):
         raise TopicError("these sensor_msgs/Imu carry no orientation (covariance[0] is -1): they "
                          "are raw data, not estimates")
     quat = values[:, IMU["orientation"]]
-    rotation = Rotation.from_quat(quat).as_matrix() if len(quat) else np.empty((0, 3, 3))
+    # Zeros: a source that left them unset. Such an orientation is not a number.
+    known = (np.linalg.norm(quat, axis=1) > 0.5)[:, None]
+    rotation = np.empty((0, 3, 3))
+    if len(quat):
+        rotation = Rotation.from_quat(np.where(known, quat, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+    quat = np.where(known, quat, np.nan)
     samples = imu_values(values)
     return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,
                        samples[:, :3], samples[:, 3:], frames[0] if frames else "")
