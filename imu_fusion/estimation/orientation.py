@@ -259,6 +259,7 @@ class OrientationEstimator:
                   yaw_offset=math.radians(p.yaw_offset_deg), gyr_density=p.gyr_noise_density,
                   gyr_bias_sd=p.gyr_bias_sd, acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
         self._alignment = a
+        self._x[st.LAG] = p.mag_delay - p.gyr_delay
         self._kernel.initialise(self._x, self._k, par, a)
         self._k[st.ALIGN_UNTIL] = stamps[-1]
         self._waiting, self._waiting_imus = [], 0
@@ -274,7 +275,7 @@ class OrientationEstimator:
     def _pack(self, p):
         par = np.zeros(self._kernel.P_SIZE)
         par[st.P_GYR_DELAY] = p.gyr_delay
-        par[st.P_MAG_DELAY] = p.mag_delay
+        par[st.P_DECLINATION] = math.radians(p.declination_deg or 0.0)
         par[st.P_MAX_LAG] = p.max_mag_lag
         par[st.P_MAX_GAP] = p.max_gap
         par[st.P_GYR_DENSITY] = p.gyr_noise_density
