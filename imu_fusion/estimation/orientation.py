@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import SampleError
+from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_alignment import align
@@ -30,8 +31,9 @@ _CHUNK = 256
 class OrientationParams(Parameters):
     """What the orientation estimator can be told."""
 
-    method: str = param("gyro_mag", choices=("gyro_mag",),
-                        doc="gyro_mag: Winkler 2025, gyroscope and magnetometer.")
+    method: str = param("fusion", choices=("fusion", "gyro_mag"),
+                        doc="fusion: error-state filter over all three sensors; gyro_mag: "
+                            "Winkler 2025, gyroscope and magnetometer.")
     world_frame: str = param("enu", choices=("enu", "ned", "nwu"),
                              doc="World axes of the published orientation.")
     declination_deg: float | None = param(
@@ -49,7 +51,8 @@ class OrientationParams(Parameters):
                                  doc="Random walk of the gyroscope bias.")
     gyr_range: tuple[float, ...] | None = param(
         None, unit="rad/s", low=1e-3, length=(1, 3),
-        doc="Largest rate the gyroscope reports, one value or one per axis; unset: none.")
+        doc="Largest rate the gyroscope reports, one value or one per axis; unset: found "
+            "from flat tops by fusion.")
     acc_noise_density: float = param(2e-3, unit="m/s^2/sqrt(Hz)", low=1e-9, high=10,
                                      doc="Accelerometer noise.")
     acc_bias_sd: float = param(0.05, unit="m/s^2", low=0, high=10,
@@ -63,12 +66,53 @@ class OrientationParams(Parameters):
         doc="Soft iron, row by row; multiplies the sample after the offset.")
     mag_reliability: float = param(5.0, low=0, doc="p of the weight (10) of Winkler 2025.")
     field_sd: float = param(0.05, low=0, high=1,
-                            doc="Wander of the local field, relative to its norm.")
-    field_time: float = param(20.0, unit="s", low=1e-3, doc="Time constant of that wander.")
+                            doc="gyro_mag: wander of the local field, relative to its norm.")
+    field_time: float = param(20.0, unit="s", low=1e-3,
+                              doc="gyro_mag: time constant of that wander.")
     gyr_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
-                             doc="How late a rate is stamped.")
-    mag_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
-                             doc="How late a magnetometer sample is stamped.")
+                             doc="How late rates and specific forces are stamped.")
+    mag_delay: float | None = param(
+        None, unit="s", low=-0.1, high=0.1,
+        doc="How late a magnetometer sample is stamped; unset: estimated by fusion, "
+            "that of the gyroscope in gyro_mag.")
+    mag_delay_sd: float = param(0.01, unit="s", low=0, high=0.1,
+                                doc="Standard deviation of a magnetometer delay that is not given.")
+    block: float = param(0.02, unit="s", low=1e-3, high=1, doc="Time between corrections.")
+    gyr_scale_sd: float = param(0.003, low=0, high=0.2,
+                                doc="Standard deviation of gyroscope scale and misalignment.")
+    estimate_bias: bool = param(True, doc="Whether gyroscope bias and scale are estimated.",
+                                read_only=False)
+    velocity_walk: float = param(0.09, unit="m/s^2/sqrt(Hz)", low=0,
+                                 doc="What the specific force does not tell of the motion.")
+    velocity_sd: float = param(0.58, unit="m/s", low=1e-3,
+                               doc="Velocity of the motion, per axis, about its mean.")
+    velocity_time: float = param(0.3, unit="s", low=1e-3, doc="Its correlation time.")
+    position_sd: float = param(0.58, unit="m", low=1e-3,
+                               doc="Extent of the motion, per axis, about its mean.")
+    position_time: float = param(0.3, unit="s", low=1e-3, doc="Its correlation time.")
+    local_field_sd: float = param(0.017, low=0, high=1,
+                                  doc="Local deviation of the field, relative to its norm.")
+    local_field_time: float = param(0.086, unit="s", low=1e-3,
+                                    doc="Time in which a moving sensor leaves it behind.")
+    field_walk: float = param(1.7e-4, unit="1/sqrt(s)", low=0, high=1,
+                              doc="Drift of the field, relative to its norm.")
+    mag_sd: float = param(0.03, low=1e-4, high=1,
+                          doc="Disturbance of the field in motion, relative to its norm.")
+    norm_deviation_factor: float = param(
+        2.9, low=0, doc="That disturbance grows by this times the deviation of the norm.")
+    mag_offset_sd: float = param(0.03, low=0, high=1,
+                                 doc="Hard iron left over by calibration, relative to the norm.")
+    mag_matrix_sd: float = param(0.019, low=0, high=1,
+                                 doc="Soft iron and misalignment left over by calibration.")
+    rest_rate: float = param(0.04, unit="rad/s", low=0,
+                             doc="Largest deviation of the rate from its mean at rest.")
+    rest_force: float = param(0.5, unit="m/s^2", low=0,
+                              doc="Largest deviation of the specific force from its mean at rest.")
+    rest_time: float = param(0.5, unit="s", low=0, doc="Time after which rest counts.")
+    rest_rate_sd: float = param(0.006, unit="rad/s", low=1e-6,
+                                doc="Rate of a hand or table at rest.")
+    saturation_walk: float = param(20.0, unit="rad/s/sqrt(s)", low=0,
+                                   doc="Random walk of a rate beyond the gyroscope's limit.")
     max_mag_lag: float = param(0.1, unit="s", low=0, high=10,
                                doc="Magnetometer samples that arrive later are dropped.")
     max_gap: float = param(0.1, unit="s", low=1e-3,
@@ -96,7 +140,7 @@ class OrientationEstimator:
 
     def __init__(self, params=OrientationParams()):
         self.params = params
-        self._kernel = gyro_mag
+        self._kernel = {"fusion": fusion, "gyro_mag": gyro_mag}[params.method]
         self._par = self._pack(params)
         self._sample = np.empty(6)
         self._mag = np.empty(3)
@@ -213,7 +257,7 @@ class OrientationEstimator:
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
             **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", bias)},
-            gyr_delay=self.params.gyr_delay, mag_delay=self.params.mag_delay)
+            gyr_delay=self.params.gyr_delay, mag_delay=self.params.gyr_delay + float(x[st.LAG]))
 
     def _step(self, stamp):
         if self._next == _CHUNK:
@@ -259,7 +303,7 @@ class OrientationEstimator:
                   yaw_offset=math.radians(p.yaw_offset_deg), gyr_density=p.gyr_noise_density,
                   gyr_bias_sd=p.gyr_bias_sd, acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
         self._alignment = a
-        self._x[st.LAG] = p.mag_delay - p.gyr_delay
+        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyr_delay
         self._kernel.initialise(self._x, self._k, par, a)
         self._k[st.ALIGN_UNTIL] = stamps[-1]
         self._waiting, self._waiting_imus = [], 0
@@ -285,7 +329,7 @@ class OrientationEstimator:
         par[st.P_RELIABILITY] = p.mag_reliability
         par[st.P_GAP_RATE_SD] = p.gap_rate_sd
         par[st.P_BIAS_WALK] = p.gyr_bias_walk
-        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.inf)
+        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.nan)
         par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
         par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset
         par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9] = p.mag_matrix
