@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.errors import SampleError
+from imu_fusion.errors import EstimationError, ParameterError, SampleError
 from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_alignment import align
+from imu_fusion.estimation.orientation_smoother import smooth
 from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
 from imu_fusion.parameters import Parameters, param
 
@@ -34,6 +35,8 @@ class OrientationParams(Parameters):
     method: str = param("fusion", choices=("fusion", "gyro_mag"),
                         doc="fusion: error-state filter over all three sensors; gyro_mag: "
                             "Winkler 2025, gyroscope and magnetometer.")
+    mode: str = param("causal", choices=("causal", "smoothed"),
+                      doc="smoothed: run() on a whole recording also looks ahead (fusion only).")
     world_frame: str = param("enu", choices=("enu", "ned", "nwu"),
                              doc="World axes of the published orientation.")
     declination_deg: float | None = param(
@@ -121,6 +124,13 @@ class OrientationParams(Parameters):
                                doc="Rate that may have gone unseen in a gap.")
 
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.mode == "smoothed" and self.method != "fusion":
+            raise ParameterError("parameter 'mode': 'smoothed' needs method 'fusion', "
+                                 f"not '{self.method}'")
+
+
 def _axes(value, default):
     """A parameter of one or three elements as (3,)."""
     return np.full(3, default) if value is None else np.broadcast_to(value, 3).astype(float)
@@ -196,12 +206,20 @@ class OrientationEstimator:
         Args:
             imu: ImuLog. mag: MagLog or None.
 
+        In mode ``smoothed`` the log must be whole: nothing is carried over from or to
+        other calls.
+
         Returns:
             ORIENTATION_DTYPE array; call :meth:`finish` for what a log shorter than the
             alignment leaves behind.
+
+        Raises:
+            EstimationError: mode ``smoothed`` in the middle of a stream.
         """
         mag_stamps = np.empty(0, dtype=np.int64) if mag is None else mag.stamp
         mags = np.empty((0, 3)) if mag is None else mag.mag
+        if self.params.mode == "smoothed":
+            return self._run_smoothed(imu, mag_stamps, mags)
         parts = []
         i = j = 0
         while self._alignment is None and i < len(imu):
@@ -287,28 +305,50 @@ class OrientationEstimator:
             return self._chunk[:0]
         return self._start()
 
+    def _run_smoothed(self, imu, mag_stamps, mags):
+        if self._alignment is not None or self._waiting:
+            raise EstimationError("mode 'smoothed' needs the whole recording in one run(); "
+                                  "reset() first, or use mode 'causal'")
+        good = np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1)
+        if not good.any():
+            return self._chunk[:0]
+        origin = imu.stamp[np.argmax(good)]
+        end = origin + int(self.params.alignment_duration * 1e9)
+        first = good & (imu.stamp <= end)
+        first_mag = np.isfinite(mags).all(axis=1) & (mag_stamps <= end)
+        samples = np.hstack([imu.gyr, imu.acc])
+        self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
+        rows = np.zeros(len(imu), ORIENTATION_DTYPE)
+        after = mag_stamps >= origin
+        written = smooth(self._x, self._k, self._par, imu.stamp, samples, mag_stamps[after],
+                         mags[after], *_views(rows))
+        return rows[:written]
+
     def _start(self):
         """Align on the waiting samples and send them through the kernel."""
-        p, par = self.params, self._par
         imus = [(s, v) for s, v in self._waiting if len(v) == 6]
+        mags = [(s, v) for s, v in self._waiting if len(v) == 3]
+        self._waiting, self._waiting_imus = [], 0
         stamps = np.array([s for s, _ in imus], dtype=np.int64)
         samples = np.array([v for _, v in imus])
-        mags = [(s, v) for s, v in self._waiting if len(v) == 3]
         mag_stamps = np.array([s for s, _ in mags], dtype=np.int64)
         mag = np.array([v for _, v in mags]).reshape(-1, 3)
-        calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
-                      @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
-        a = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
-                  declination=math.radians(p.declination_deg or 0.0),
-                  yaw_offset=math.radians(p.yaw_offset_deg), gyr_density=p.gyr_noise_density,
-                  gyr_bias_sd=p.gyr_bias_sd, acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
-        self._alignment = a
-        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyr_delay
-        self._kernel.initialise(self._x, self._k, par, a)
-        self._k[st.ALIGN_UNTIL] = stamps[-1]
-        self._waiting, self._waiting_imus = [], 0
+        self._align(stamps, samples, mag_stamps, mag)
         after = mag_stamps >= stamps[0]
         return self._run_kernel(stamps, samples, mag_stamps[after], mag[after])
+
+    def _align(self, stamps, samples, mag_stamps, mag):
+        p, par = self.params, self._par
+        calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
+                      @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
+        self._alignment = align(
+            stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
+            declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
+            gyr_density=p.gyr_noise_density, gyr_bias_sd=p.gyr_bias_sd,
+            acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
+        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyr_delay
+        self._kernel.initialise(self._x, self._k, par, self._alignment)
+        self._k[st.ALIGN_UNTIL] = stamps[-1]
 
     def _run_kernel(self, stamps, samples, mag_stamps, mags):
         rows = np.zeros(len(stamps), ORIENTATION_DTYPE)

@@ -47,7 +47,8 @@ MAX_OPS = 16
 
 # One block on the tape.
 TAPE_OPS = 0
-TAPE_MOVE = 1
+TAPE_TURNED = 1        # 1 where the world's axes were turned: nothing passes back
+TAPE_MOVE = 2
 TAPE_COV = TAPE_MOVE + MOVE_SIZE
 TAPE_OP = TAPE_COV + N * N
 TAPE_SIZE = TAPE_OP + MAX_OPS * OP_SIZE

@@ -53,7 +53,8 @@ REST_SINCE = BLOCK_MAGS + 1
 CLIPPED = BLOCK_MAGS + 2   # bit per axis at its limit
 WAS_CLIPPED = BLOCK_MAGS + 3  # the same in the block before
 REPEATS = BLOCK_MAGS + 4   # (3,) how often each axis repeated its largest value
-K_SIZE = REPEATS + 3
+WORLD_TURNED = REPEATS + 3  # the heading was fixed in this block
+K_SIZE = WORLD_TURNED + 1
 
 # Parameters.
 (P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,
@@ -151,6 +152,7 @@ def _start_field(x, par, field):
 @njit(cache=True)
 def _fix_heading(x, k, par, z):
     """Turn the world about up so that ``z`` (3,) tesla, world axes, points magnetic north."""
+    k[WORLD_TURNED] = 1
     horizontal = math.hypot(z[0], z[1])
     norm = math.sqrt(horizontal ** 2 + z[2] ** 2)
     if horizontal < 0.02 * norm:
@@ -344,6 +346,8 @@ def _end_block(x, k, par, still, back, tape):
     x[st.LAG] = x[S + es.LAG]
     if len(tape):
         tape[es.TAPE_COV:es.TAPE_COV + N * N] = x[COV:COV + N * N]
+        tape[es.TAPE_TURNED] = k[WORLD_TURNED]
+    k[WORLD_TURNED] = 0
     x[MOVE:MOVE + es.MOVE_SIZE] = 0.0
     x[MAG_SUM:MAG_SUM + MAG_ROWS] = 0.0
     k[BLOCK_MAGS] = 0
@@ -413,12 +417,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     if clipped:
         flags |= st.FLAG_SATURATED
         k[st.SATURATED] += 1
-    if clipped & ~k[CLIPPED]:
-        # A burst begins: close the block before it.
-        if move[es.MOVE_TIME] > 0.0:
-            _end_block(x, k, par, False, 0, tape)
-            move = x[MOVE:MOVE + es.MOVE_SIZE]
-        k[CLIPPED] |= clipped
+    k[CLIPPED] |= clipped
 
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()

@@ -46,7 +46,9 @@ FLAG_NO_HEADING = 64    # no magnetometer sample has fixed the heading yet
 UNIFORM_VARIANCE = math.pi ** 2 / 3.0   # rad^2, of an angle about which nothing is known
 
 ROW_WORDS = ORIENTATION_DTYPE.itemsize // 8
-_STAMP, _QUAT, _COV, _GYR, _COV_GYR, _ACC, _COV_ACC, _BIAS, _BIAS_SD, _MAG, _REL, _FLAGS = (
+# Offsets of the fields in words.
+(ROW_STAMP, ROW_QUAT, ROW_COV, ROW_GYR, ROW_COV_GYR, ROW_ACC, ROW_COV_ACC, ROW_BIAS,
+ ROW_BIAS_SD, ROW_MAG, ROW_RELIABILITY, FLAGS_WORD) = (
     ORIENTATION_DTYPE.fields[name][1] // 8 for name in ORIENTATION_DTYPE.names[:-1])
 
 # Float state common to all kernels.
@@ -212,8 +214,8 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
     """
     frame = par[P_FRAME:P_FRAME + 4]
     ahead = quat_multiply(quat, quat_exp(par[P_GYR_DELAY] * gyr))
-    row_int[_STAMP] = stamp
-    row[_QUAT:_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
+    row_int[ROW_STAMP] = stamp
+    row[ROW_QUAT:ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
     r = quat_to_matrix(ahead)
     for i in range(3):
         for j in range(3):
@@ -221,14 +223,14 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
             for m in range(3):
                 for n in range(3):
                     total += r[m, i] * cov_world[m, n] * r[n, j]
-            row[_COV + 3 * i + j] = total
-            row[_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
-            row[_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
+            row[ROW_COV + 3 * i + j] = total
+            row[ROW_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
+            row[ROW_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
     for i in range(3):
-        row[_GYR + i] = gyr[i]
-        row[_ACC + i] = acc[i]
-        row[_BIAS + i] = bias[i]
-        row[_BIAS_SD + i] = math.sqrt(max(bias_var[i], 0.0))
-    row[_MAG:_MAG + 3] = quat_rotate(frame, quat_rotate(quat, mag))
-    row[_REL] = reliability
-    row_int[_FLAGS] = flags + (mag_count << 32)
+        row[ROW_GYR + i] = gyr[i]
+        row[ROW_ACC + i] = acc[i]
+        row[ROW_BIAS + i] = bias[i]
+        row[ROW_BIAS_SD + i] = math.sqrt(max(bias_var[i], 0.0))
+    row[ROW_MAG:ROW_MAG + 3] = quat_rotate(frame, quat_rotate(quat, mag))
+    row[ROW_RELIABILITY] = reliability
+    row_int[FLAGS_WORD] = flags + (mag_count << 32)
