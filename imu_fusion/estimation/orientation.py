@@ -50,7 +50,7 @@ class OrientationParams(Parameters):
                                      doc="Gyroscope noise.")
     gyr_bias_sd: float = param(0.01, unit="rad/s", low=0, high=1,
                                doc="Standard deviation of a bias that no rest has shown.")
-    gyr_bias_walk: float = param(1e-5, unit="rad/s/sqrt(s)", low=0, high=1,
+    gyr_bias_walk: float = param(2e-5, unit="rad/s/sqrt(s)", low=0, high=1,
                                  doc="Random walk of the gyroscope bias.")
     gyr_range: tuple[float, ...] | None = param(
         None, unit="rad/s", low=1e-3, length=(1, 3),
@@ -85,27 +85,27 @@ class OrientationParams(Parameters):
                                 doc="Standard deviation of gyroscope scale and misalignment.")
     estimate_bias: bool = param(True, doc="Whether gyroscope bias and scale are estimated.",
                                 read_only=False)
-    velocity_walk: float = param(0.09, unit="m/s^2/sqrt(Hz)", low=0,
+    velocity_walk: float = param(0.1, unit="m/s^2/sqrt(Hz)", low=0,
                                  doc="What the specific force does not tell of the motion.")
-    velocity_sd: float = param(0.58, unit="m/s", low=1e-3,
+    velocity_sd: float = param(0.6, unit="m/s", low=1e-3,
                                doc="Velocity of the motion, per axis, about its mean.")
     velocity_time: float = param(0.3, unit="s", low=1e-3, doc="Its correlation time.")
-    position_sd: float = param(0.58, unit="m", low=1e-3,
+    position_sd: float = param(0.6, unit="m", low=1e-3,
                                doc="Extent of the motion, per axis, about its mean.")
     position_time: float = param(0.3, unit="s", low=1e-3, doc="Its correlation time.")
-    local_field_sd: float = param(0.017, low=0, high=1,
+    local_field_sd: float = param(0.01, low=0, high=1,
                                   doc="Local deviation of the field, relative to its norm.")
-    local_field_time: float = param(0.086, unit="s", low=1e-3,
+    local_field_time: float = param(0.3, unit="s", low=1e-3,
                                     doc="Time in which a moving sensor leaves it behind.")
-    field_walk: float = param(1.7e-4, unit="1/sqrt(s)", low=0, high=1,
+    field_walk: float = param(1e-4, unit="1/sqrt(s)", low=0, high=1,
                               doc="Drift of the field, relative to its norm.")
     mag_sd: float = param(0.03, low=1e-4, high=1,
                           doc="Disturbance of the field in motion, relative to its norm.")
     norm_deviation_factor: float = param(
-        2.9, low=0, doc="That disturbance grows by this times the deviation of the norm.")
+        3.0, low=0, doc="That disturbance grows by this times the deviation of the norm.")
     mag_offset_sd: float = param(0.03, low=0, high=1,
                                  doc="Hard iron left over by calibration, relative to the norm.")
-    mag_matrix_sd: float = param(0.019, low=0, high=1,
+    mag_matrix_sd: float = param(0.02, low=0, high=1,
                                  doc="Soft iron and misalignment left over by calibration.")
     rest_rate: float = param(0.04, unit="rad/s", low=0,
                              doc="Largest deviation of the rate from its mean at rest.")

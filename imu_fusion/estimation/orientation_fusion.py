@@ -66,6 +66,7 @@ P_SIZE = st.P_COMMON + 21
 _REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
+_BURST_SHARE = 0.5         # of the block, while an axis is at its limit
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
 _ENTRY_SHARE = 2e-3        # a flat top is run into; a quantised smooth peak is not
 _LIMIT_FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
@@ -476,7 +477,8 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
         flags |= st.FLAG_STILL
     back = 0 if clipped == k[CLIPPED] or first else k[CLIPPED] & ~clipped
     result = 1
-    if back or move[es.MOVE_TIME] >= par[P_BLOCK] - 1e-6:
+    length = par[P_BLOCK] * (_BURST_SHARE if k[CLIPPED] else 1.0)
+    if back or move[es.MOVE_TIME] >= length - 1e-6:
         _end_block(x, k, par, still, back, tape)
         result = 2
         k[CLIPPED] &= ~back
@@ -510,7 +512,13 @@ def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, taken, row, 
                            + par[P_EXCESS_WALK] ** 2 * (since + noise_dt))
         force[i] = acc[i] - x[S + es.ACC_BIAS + i]
     cov_world[2, 2] += x[HEADING_VAR]
-    st.write_row(row, row_int, par, stamp, x[st.Q:st.Q + 4], cov_world, _rate(x, gyr), var_gyr,
+    rate = _rate(x, gyr)
+    if flags & st.FLAG_SATURATED:
+        for i in range(3):
+            limit = x[LIMIT + i]
+            if abs(gyr[i]) >= limit * (1.0 - 1e-6):
+                rate[i] = math.copysign(max(abs(rate[i]), limit), gyr[i])
+    st.write_row(row, row_int, par, stamp, x[st.Q:st.Q + 4], cov_world, rate, var_gyr,
                  force, par[st.P_ACC_DENSITY] ** 2 / noise_dt + cov[es.ACC_BIAS, es.ACC_BIAS],
                  x[S + es.BIAS:S + es.BIAS + 3], bias_var, mag, reliability, flags, taken)
 
