@@ -1,0 +1,177 @@
+"""Kernels of the rigid-body estimator of acceleration fields (numba).
+
+State of n = 18 + m numbers, for m measured channels:
+
+    0:3    theta   local attitude error, q_true = quat * Exp(theta)
+    3:6    omega   angular velocity, body axes
+    6:9    alpha   angular acceleration, body axes
+    9:12   its rate
+    12:15  a       acceleration (or specific force) at the reference point, body axes
+    15:18  its rate
+    18:    bias    one per channel
+
+An accelerometer channel along the unit vector u at the position r from the reference point
+reads ``u . (a + alpha x r + omega x (omega x r)) + bias`` (Rahaman 2019, eq. (2.33) in body
+axes), a gyroscope channel ``u . omega + bias``. The rates of alpha and a are Wiener processes.
+Measurements enter one channel at a time, so that no matrix is inverted; each touches at most
+ten states.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
+                                          right_jacobian)
+
+THETA, OMEGA, ALPHA, JERK, ACC, ACC_RATE, BIAS = 0, 3, 6, 9, 12, 15, 18
+# States that one channel touches: omega, alpha, a and its own bias.
+TOUCHED = 10
+
+
+@njit(cache=True)
+def mean_rotation(dt, omega, alpha, jerk):
+    """Rotation vector over dt of a body whose rate is omega + alpha t + jerk t^2 / 2.
+
+    Magnus expansion to the fourth order (Iserles et al. 2000): the integral of the rate and the
+    commutator of its endpoints, for body-frame rates. All (3,). Returns (3,).
+    """
+    integral = dt * omega + (0.5 * dt * dt) * alpha + (dt * dt * dt / 6.0) * jerk
+    last = omega + dt * alpha + (0.5 * dt * dt) * jerk
+    return integral + (dt * dt / 12.0) * np.cross(omega, last)
+
+
+@njit(cache=True)
+def transition(dt, phi):
+    """Blocks of the transition matrix of theta: (Exp(-phi), right Jacobian). Both (3, 3)."""
+    return np.ascontiguousarray(quat_to_matrix(quat_exp(phi)).T), right_jacobian(phi)
+
+
+@njit(cache=True)
+def multiply_transition(m, dt, turn, jac):
+    """m <- F m in place, m: (n, c)."""
+    h2 = 0.5 * dt * dt
+    h3 = dt * dt * dt / 6.0
+    for c in range(m.shape[1]):
+        t0, t1, t2 = m[0, c], m[1, c], m[2, c]
+        d0 = dt * m[3, c] + h2 * m[6, c] + h3 * m[9, c]
+        d1 = dt * m[4, c] + h2 * m[7, c] + h3 * m[10, c]
+        d2 = dt * m[5, c] + h2 * m[8, c] + h3 * m[11, c]
+        for i in range(3):
+            m[i, c] = (turn[i, 0] * t0 + turn[i, 1] * t1 + turn[i, 2] * t2
+                       + jac[i, 0] * d0 + jac[i, 1] * d1 + jac[i, 2] * d2)
+            m[3 + i, c] += dt * m[6 + i, c] + h2 * m[9 + i, c]
+            m[6 + i, c] += dt * m[9 + i, c]
+            m[12 + i, c] += dt * m[15 + i, c]
+
+
+@njit(cache=True)
+def multiply_transition_transposed(m, dt, turn, jac):
+    """m <- F' m in place, m: (n, c)."""
+    h2 = 0.5 * dt * dt
+    h3 = dt * dt * dt / 6.0
+    for c in range(m.shape[1]):
+        t0, t1, t2 = m[0, c], m[1, c], m[2, c]
+        for i in range(3):
+            d = jac[0, i] * t0 + jac[1, i] * t1 + jac[2, i] * t2
+            m[i, c] = turn[0, i] * t0 + turn[1, i] * t1 + turn[2, i] * t2
+            m[9 + i, c] += dt * m[6 + i, c] + h2 * m[3 + i, c] + h3 * d
+            m[6 + i, c] += dt * m[3 + i, c] + h2 * d
+            m[3 + i, c] += dt * d
+            m[15 + i, c] += dt * m[12 + i, c]
+
+
+@njit(cache=True)
+def predict(x, cov, quat, dt, jerk_density, acc_density, bias_walk):
+    """Move state (n,), covariance (n, n) and quaternion (4,) on by dt, in place.
+
+    jerk_density, acc_density: densities of the Wiener processes of the rates of alpha and a.
+    bias_walk: (m,) densities of the random walks of the biases.
+    """
+    phi = mean_rotation(dt, x[3:6], x[6:9], x[9:12])
+    turn, jac = transition(dt, phi)
+    quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
+    for i in range(3):
+        x[3 + i] += dt * x[6 + i] + 0.5 * dt * dt * x[9 + i]
+        x[6 + i] += dt * x[9 + i]
+        x[12 + i] += dt * x[15 + i]
+    multiply_transition(cov, dt, turn, jac)
+    half = np.ascontiguousarray(cov.T)
+    multiply_transition(half, dt, turn, jac)
+    for i in range(len(x)):
+        for j in range(i, len(x)):
+            mean = 0.5 * (half[i, j] + half[j, i])
+            cov[i, j] = mean
+            cov[j, i] = mean
+    # Chains of integrators driven by white noise, integrated exactly; order[k] integrations
+    # lie between the noise and the state, scale 1/order!.
+    q = jerk_density * jerk_density
+    for i in range(3):
+        for k in range(4):
+            for l in range(4):
+                order = (3 - k) + (3 - l) + 1
+                cov[3 * k + i, 3 * l + i] += (q * dt ** order / order
+                                              / (math.gamma(4.0 - k) * math.gamma(4.0 - l)))
+    q = acc_density * acc_density
+    for i in range(3):
+        cov[12 + i, 12 + i] += q * dt ** 3 / 3.0
+        cov[12 + i, 15 + i] += 0.5 * q * dt * dt
+        cov[15 + i, 12 + i] += 0.5 * q * dt * dt
+        cov[15 + i, 15 + i] += q * dt
+    for c in range(len(bias_walk)):
+        cov[18 + c, 18 + c] += bias_walk[c] * bias_walk[c] * dt
+    return phi
+
+
+@njit(cache=True)
+def channel_row(is_gyro, u, r, c, omega, index, h):
+    """Indices and values of the row of channel c, linearised at omega.
+
+    Returns (number of entries, constant): the reading is h . x[index] + constant.
+    """
+    if is_gyro:
+        for i in range(3):
+            index[i] = OMEGA + i
+            h[i] = u[i]
+        index[3] = BIAS + c
+        h[3] = 1.0
+        return 4, 0.0
+    uw = u[0] * omega[0] + u[1] * omega[1] + u[2] * omega[2]
+    rw = r[0] * omega[0] + r[1] * omega[1] + r[2] * omega[2]
+    ur = u[0] * r[0] + u[1] * r[1] + u[2] * r[2]
+    for i in range(3):
+        index[i] = OMEGA + i
+        h[i] = u[i] * rw + r[i] * uw - 2.0 * ur * omega[i]
+        index[3 + i] = ALPHA + i
+        j, k = (i + 1) % 3, (i + 2) % 3
+        h[3 + i] = r[j] * u[k] - r[k] * u[j]
+        index[6 + i] = ACC + i
+        h[6 + i] = u[i]
+    index[9] = BIAS + c
+    h[9] = 1.0
+    # The centripetal part is quadratic, so its value is half its gradient times omega.
+    return 10, -0.5 * (h[0] * omega[0] + h[1] * omega[1] + h[2] * omega[2])
+
+
+@njit(cache=True)
+def scalar_update(x, cov, index, h, count, innovation, variance, column):
+    """Kalman update by one scalar with a sparse row, in place; ``column`` receives P H'.
+
+    Returns the innovation variance.
+    """
+    n = len(x)
+    for i in range(n):
+        s = 0.0
+        for k in range(count):
+            s += cov[index[k], i] * h[k]
+        column[i] = s
+    total = variance
+    for k in range(count):
+        total += h[k] * column[index[k]]
+    for i in range(n):
+        gain = column[i] / total
+        x[i] += gain * innovation
+        for j in range(n):
+            cov[i, j] -= gain * column[j]
+    return total
