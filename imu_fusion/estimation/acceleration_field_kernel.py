@@ -22,10 +22,12 @@ import math
 import numpy as np
 from numba import njit
 
+from imu_fusion.estimation.acceleration_field_rows import (GAP, HELD, MISSING, SATURATED, put_row,
+                                                           rigid_gradient)
 from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
                                           right_jacobian)
 
-THETA, OMEGA, ALPHA, JERK, ACC, ACC_RATE, BIAS = 0, 3, 6, 9, 12, 15, 18
+OMEGA, ALPHA, ACC, BIAS = 3, 6, 12, 18
 # States that one channel touches: omega, alpha, a and its own bias.
 TOUCHED = 10
 
@@ -175,3 +177,137 @@ def scalar_update(x, cov, index, h, count, innovation, variance, column):
         for j in range(n):
             cov[i, j] -= gain * column[j]
     return total
+
+
+@njit(cache=True)
+def update(x, cov, quat, reading, is_gyro, direction, lever, variance, ranges, at, trace_column,
+           trace_total, trace_innovation, trace_row):
+    """All channels of one sample, linearised at the angular velocity ``at`` (3,), in place.
+
+    reading: (m,) with NaN for missing channels; a channel at its range is not used. The traces,
+    rows of one sample, keep what the smoother needs; a total of zero marks an unused channel.
+
+    Returns (sum of squared normalised innovations, log likelihood, channels used, flags).
+    """
+    index = np.empty(TOUCHED, np.int64)
+    row = np.empty(TOUCHED)
+    squares, log_likelihood, used, flag = 0.0, 0.0, 0, 0
+    for c in range(len(variance)):
+        trace_total[c] = 0.0
+        if math.isnan(reading[c]):
+            flag |= MISSING
+            continue
+        if abs(reading[c]) >= ranges[c]:
+            flag |= SATURATED
+            continue
+        count, constant = channel_row(is_gyro[c], direction[c], lever[c], c, at, index, row)
+        innovation = reading[c] - constant
+        for k in range(count):
+            innovation -= row[k] * x[index[k]]
+        total = scalar_update(x, cov, index, row, count, innovation, variance[c],
+                              trace_column[c])
+        trace_total[c] = total
+        trace_innovation[c] = innovation
+        trace_row[c] = row
+        squares += innovation * innovation / total
+        log_likelihood -= 0.5 * (math.log(2.0 * math.pi * total) + innovation * innovation / total)
+        used += 1
+    quat[:] = quat_normalize(quat_multiply(quat, quat_exp(x[0:3])))
+    x[0:3] = 0.0
+    return squares, log_likelihood, used, flag
+
+
+@njit(cache=True)
+def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, variance, ranges,
+            bias_walk, jerk_density, acc_density, max_gap, at, fixed_at, reference, gravity,
+            specific_force, values, flags, trace):
+    """Filter n samples in order, in place; one row of values (n, 71) and flags (n,) each.
+
+    last: (1,) int64 stamp of the previous sample, negative before the first. at: (n, 3)
+    angular velocities to linearise at if ``fixed_at``, else each prediction is used. trace: a
+    tuple of arrays (x, cov, phi, dt, columns, totals, innovations, rows) of n samples, or of
+    one sample when it is not wanted (then values are written instead).
+
+    Returns the log likelihood of the readings.
+    """
+    xs, covs, phis, dts, columns, totals, innovations, rows = trace
+    keep = len(values) == 0
+    likelihood = 0.0
+    for n in range(len(stamp)):
+        k = n if keep else 0
+        flag = 0
+        dts[k] = 0.0
+        if last[0] >= 0:
+            dt = (stamp[n] - last[0]) * 1e-9
+            phis[k] = predict(x, cov, quat, dt, jerk_density, acc_density, bias_walk)
+            dts[k] = dt
+            if dt > max_gap:
+                flag |= GAP
+        last[0] = stamp[n]
+        if keep:
+            xs[k] = x
+            covs[k] = cov
+        where = at[n].copy() if fixed_at else x[3:6].copy()
+        squares, log_likelihood, used, seen = update(
+            x, cov, quat, readings[n], is_gyro, direction, lever, variance, ranges, where,
+            columns[k], totals[k], innovations[k], rows[k])
+        likelihood += log_likelihood
+        if not keep:
+            flag |= seen
+            residual = math.nan
+            if used > 0:
+                residual = math.sqrt(squares / used)
+            else:
+                flag |= HELD
+            put_row(values[n], rigid_gradient(x[3:6], x[6:9]), x[:18],
+                    np.ascontiguousarray(cov[:18, :18]), quat, reference, gravity,
+                    specific_force, residual)
+            flags[n] = flag
+    return likelihood
+
+
+@njit(cache=True)
+def backward(adjoint, information, trace, is_gyro, direction, lever, smoothed, smoothed_cov):
+    """Modified Bryson-Frazier smoother over the n samples of a trace (Bierman 1977), in place.
+
+    adjoint (n_x, 1) and information (n_x, n_x) carry on from the samples after these and end
+    before these. It inverts nothing, so constant biases and exact starts need no care.
+
+    smoothed: (n, n_x); its theta is relative to the predicted attitude. smoothed_cov:
+    (n, 18, 18).
+    """
+    xs, covs, phis, dts, columns, totals, innovations, rows = trace
+    index = np.empty(TOUCHED, np.int64)
+    unused = np.empty(TOUCHED)
+    for n in range(len(xs) - 1, -1, -1):
+        for c in range(totals.shape[1] - 1, -1, -1):
+            total = totals[n, c]
+            if total == 0.0:
+                continue
+            count, _ = channel_row(is_gyro[c], direction[c], lever[c], c, unused, index, unused)
+            row = rows[n, c]
+            gain = columns[n, c] / total
+            spread = information @ gain
+            quadratic = 1.0 / total + np.dot(gain, spread)
+            pull = innovations[n, c] / total
+            for j in range(len(gain)):
+                pull += gain[j] * adjoint[j, 0]
+            for k in range(count):
+                i, h = index[k], row[k]
+                adjoint[i, 0] -= h * pull
+                for j in range(len(gain)):
+                    information[i, j] -= h * spread[j]
+                    information[j, i] -= h * spread[j]
+            for k in range(count):
+                for l in range(count):
+                    information[index[k], index[l]] += row[k] * row[l] * quadratic
+        smoothed[n] = xs[n] - (covs[n] @ adjoint)[:, 0]
+        part = np.ascontiguousarray(covs[n][:18])
+        smoothed_cov[n] = part[:, :18] - part @ information @ part.T
+        if dts[n] > 0.0:
+            turn, jac = transition(dts[n], phis[n])
+            multiply_transition_transposed(adjoint, dts[n], turn, jac)
+            multiply_transition_transposed(information, dts[n], turn, jac)
+            half = np.ascontiguousarray(information.T)
+            multiply_transition_transposed(half, dts[n], turn, jac)
+            information[:] = 0.5 * (half + half.T)
