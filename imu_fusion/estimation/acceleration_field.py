@@ -73,6 +73,9 @@ class AccelerationFieldParams(Parameters):
     motion__jerk_density: float = param(
         5e4, unit="rad/s^3/sqrt(s)", low=1e-12,
         doc="rigid_body: how fast the rate of the angular acceleration wanders.")
+    motion__rate: float = param(
+        0.0, unit="1/s", low=0,
+        doc="rigid_body: how fast the angular acceleration forgets itself; 0: not at all.")
     motion__acceleration_rate_density: float = param(
         3e3, unit="m/s^3/sqrt(s)", low=1e-12,
         doc="rigid_body: how fast the rate of the linear acceleration wanders.")

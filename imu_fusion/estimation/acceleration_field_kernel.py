@@ -12,7 +12,8 @@ State of n = 18 + m numbers, for m measured channels:
 
 An accelerometer channel along the unit vector u at the position r from the reference point
 reads ``u . (a + alpha x r + omega x (omega x r)) + bias`` (Rahaman 2019, eq. (2.33) in body
-axes), a gyroscope channel ``u . omega + bias``. The rates of alpha and a are Wiener processes.
+axes), a gyroscope channel ``u . omega + bias``. alpha is a Matern process (or, with rate zero,
+an integrated Wiener process), the rate of a is a Wiener process.
 Measurements enter one channel at a time, so that no matrix is inverted; each touches at most
 ten states.
 """
@@ -32,91 +33,135 @@ OMEGA, ALPHA, ACC, BIAS = 3, 6, 12, 18
 TOUCHED = 10
 
 
-@njit(cache=True)
-def mean_rotation(dt, omega, alpha, jerk):
-    """Rotation vector over dt of a body whose rate is omega + alpha t + jerk t^2 / 2.
+# Gauss-Legendre rule on [0, 1]: exact for the degree that a chain of four integrators needs.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
-    Magnus expansion to the fourth order (Iserles et al. 2000): the integral of the rate and the
-    commutator of its endpoints, for body-frame rates. All (3,). Returns (3,).
+
+@njit(cache=True)
+def _generate(v, rate):
+    """Time derivative of the chain (angle, omega, alpha, jerk) v (4,), without noise."""
+    return np.array([v[1], v[2], v[3], -rate * rate * v[2] - 2.0 * rate * v[3]])
+
+
+@njit(cache=True)
+def _propagate(v, rate, dt):
+    """v (4,) after dt, by its Taylor series; for rate * dt up to one half."""
+    total, term = v.copy(), v.copy()
+    for k in range(1, 16):
+        term = _generate(term, rate) * (dt / k)
+        total = total + term
+    return total
+
+
+@njit(cache=True)
+def motion_step(dt, rate):
+    """Transition (4, 4) and unit-noise covariance (4, 4) of one axis over dt, exactly.
+
+    The chain is angle, omega, alpha, jerk with ``jerk' = -rate^2 alpha - 2 rate jerk + noise``:
+    alpha is a Matern process of smoothness 3/2; with rate 0 the jerk is a Wiener process. Short
+    steps by quadrature, long ones by doubling them, so that any gap is fine.
     """
-    integral = dt * omega + (0.5 * dt * dt) * alpha + (dt * dt * dt / 6.0) * jerk
-    last = omega + dt * alpha + (0.5 * dt * dt) * jerk
-    return integral + (dt * dt / 12.0) * np.cross(omega, last)
+    doublings = 0
+    while rate * dt > 0.5 * 2.0 ** doublings:
+        doublings += 1
+    h = dt / 2.0 ** doublings
+    step = np.zeros((4, 4))
+    for k in range(4):
+        unit = np.zeros(4)
+        unit[k] = 1.0
+        step[:, k] = _propagate(unit, rate, h)
+    noise = np.zeros((4, 4))
+    for k in range(len(_NODES)):
+        response = _propagate(np.array([0.0, 0.0, 0.0, 1.0]), rate, h * _NODES[k])
+        noise += (h * _WEIGHTS[k]) * np.outer(response, response)
+    for _ in range(doublings):
+        noise = step @ noise @ step.T + noise
+        step = step @ step
+    return step, noise
 
 
 @njit(cache=True)
-def transition(dt, phi):
+def mean_rotation(dt, step, x):
+    """Rotation vector (3,) over a step of the mean x, by the Magnus expansion to the fourth
+    order (Iserles et al. 2000): the integral of the body rate and the commutator of its ends."""
+    w = x[3:6]
+    integral = step[0, 1] * w + step[0, 2] * x[6:9] + step[0, 3] * x[9:12]
+    last = w + step[1, 2] * x[6:9] + step[1, 3] * x[9:12]
+    return integral + (dt * dt / 12.0) * np.cross(w, last)
+
+
+@njit(cache=True)
+def transition(phi):
     """Blocks of the transition matrix of theta: (Exp(-phi), right Jacobian). Both (3, 3)."""
     return np.ascontiguousarray(quat_to_matrix(quat_exp(phi)).T), right_jacobian(phi)
 
 
 @njit(cache=True)
-def multiply_transition(m, dt, turn, jac):
+def multiply_transition(m, dt, step, turn, jac):
     """m <- F m in place, m: (n, c)."""
-    h2 = 0.5 * dt * dt
-    h3 = dt * dt * dt / 6.0
     for c in range(m.shape[1]):
         t0, t1, t2 = m[0, c], m[1, c], m[2, c]
-        d0 = dt * m[3, c] + h2 * m[6, c] + h3 * m[9, c]
-        d1 = dt * m[4, c] + h2 * m[7, c] + h3 * m[10, c]
-        d2 = dt * m[5, c] + h2 * m[8, c] + h3 * m[11, c]
+        d0 = step[0, 1] * m[3, c] + step[0, 2] * m[6, c] + step[0, 3] * m[9, c]
+        d1 = step[0, 1] * m[4, c] + step[0, 2] * m[7, c] + step[0, 3] * m[10, c]
+        d2 = step[0, 1] * m[5, c] + step[0, 2] * m[8, c] + step[0, 3] * m[11, c]
         for i in range(3):
             m[i, c] = (turn[i, 0] * t0 + turn[i, 1] * t1 + turn[i, 2] * t2
                        + jac[i, 0] * d0 + jac[i, 1] * d1 + jac[i, 2] * d2)
-            m[3 + i, c] += dt * m[6 + i, c] + h2 * m[9 + i, c]
-            m[6 + i, c] += dt * m[9 + i, c]
+            alpha, jerk = m[6 + i, c], m[9 + i, c]
+            m[3 + i, c] += step[1, 2] * alpha + step[1, 3] * jerk
+            m[6 + i, c] = step[2, 2] * alpha + step[2, 3] * jerk
+            m[9 + i, c] = step[3, 2] * alpha + step[3, 3] * jerk
             m[12 + i, c] += dt * m[15 + i, c]
 
 
 @njit(cache=True)
-def multiply_transition_transposed(m, dt, turn, jac):
+def multiply_transition_transposed(m, dt, step, turn, jac):
     """m <- F' m in place, m: (n, c)."""
-    h2 = 0.5 * dt * dt
-    h3 = dt * dt * dt / 6.0
     for c in range(m.shape[1]):
         t0, t1, t2 = m[0, c], m[1, c], m[2, c]
         for i in range(3):
             d = jac[0, i] * t0 + jac[1, i] * t1 + jac[2, i] * t2
+            omega, alpha, jerk = m[3 + i, c], m[6 + i, c], m[9 + i, c]
             m[i, c] = turn[0, i] * t0 + turn[1, i] * t1 + turn[2, i] * t2
-            m[9 + i, c] += dt * m[6 + i, c] + h2 * m[3 + i, c] + h3 * d
-            m[6 + i, c] += dt * m[3 + i, c] + h2 * d
-            m[3 + i, c] += dt * d
+            m[3 + i, c] = omega + step[0, 1] * d
+            m[6 + i, c] = (step[0, 2] * d + step[1, 2] * omega + step[2, 2] * alpha
+                           + step[3, 2] * jerk)
+            m[9 + i, c] = (step[0, 3] * d + step[1, 3] * omega + step[2, 3] * alpha
+                           + step[3, 3] * jerk)
             m[15 + i, c] += dt * m[12 + i, c]
 
 
 @njit(cache=True)
-def predict(x, cov, quat, dt, jerk_density, acc_density, bias_walk):
+def predict(x, cov, quat, dt, step, noise, jerk_density, acc_density, bias_walk):
     """Move state (n,), covariance (n, n) and quaternion (4,) on by dt, in place.
 
-    jerk_density, acc_density: densities of the Wiener processes of the rates of alpha and a.
-    bias_walk: (m,) densities of the random walks of the biases.
+    step, noise: of :func:`motion_step`. jerk_density, acc_density: densities of the noise that
+    drives the rates of alpha and a. bias_walk: (m,) densities of the random walks of the biases.
+    Returns the mean rotation (3,).
     """
-    phi = mean_rotation(dt, x[3:6], x[6:9], x[9:12])
-    turn, jac = transition(dt, phi)
+    phi = mean_rotation(dt, step, x)
+    turn, jac = transition(phi)
     quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
     for i in range(3):
-        x[3 + i] += dt * x[6 + i] + 0.5 * dt * dt * x[9 + i]
-        x[6 + i] += dt * x[9 + i]
+        alpha, jerk = x[6 + i], x[9 + i]
+        x[3 + i] += step[1, 2] * alpha + step[1, 3] * jerk
+        x[6 + i] = step[2, 2] * alpha + step[2, 3] * jerk
+        x[9 + i] = step[3, 2] * alpha + step[3, 3] * jerk
         x[12 + i] += dt * x[15 + i]
-    multiply_transition(cov, dt, turn, jac)
+    multiply_transition(cov, dt, step, turn, jac)
     half = np.ascontiguousarray(cov.T)
-    multiply_transition(half, dt, turn, jac)
+    multiply_transition(half, dt, step, turn, jac)
     for i in range(len(x)):
         for j in range(i, len(x)):
             mean = 0.5 * (half[i, j] + half[j, i])
             cov[i, j] = mean
             cov[j, i] = mean
-    # Chains of integrators driven by white noise, integrated exactly; order[k] integrations
-    # lie between the noise and the state, scale 1/order!.
-    q = jerk_density * jerk_density
+    q = acc_density * acc_density
     for i in range(3):
         for k in range(4):
             for l in range(4):
-                order = (3 - k) + (3 - l) + 1
-                cov[3 * k + i, 3 * l + i] += (q * dt ** order / order
-                                              / (math.gamma(4.0 - k) * math.gamma(4.0 - l)))
-    q = acc_density * acc_density
-    for i in range(3):
+                cov[3 * k + i, 3 * l + i] += jerk_density * jerk_density * noise[k, l]
         cov[12 + i, 12 + i] += q * dt ** 3 / 3.0
         cov[12 + i, 15 + i] += 0.5 * q * dt * dt
         cov[15 + i, 12 + i] += 0.5 * q * dt * dt
@@ -219,7 +264,7 @@ def update(x, cov, quat, reading, is_gyro, direction, lever, variance, ranges, a
 
 @njit(cache=True)
 def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, variance, ranges,
-            bias_walk, jerk_density, acc_density, max_gap, at, fixed_at, reference, gravity,
+            bias_walk, jerk_density, motion_rate, acc_density, max_gap, at, fixed_at, reference, gravity,
             specific_force, values, flags, trace):
     """Filter n samples in order, in place; one row of values (n, 71) and flags (n,) each.
 
@@ -231,6 +276,8 @@ def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, vari
     Returns the log likelihood of the readings.
     """
     xs, covs, phis, dts, columns, totals, innovations, rows = trace
+    step, noise = motion_step(0.0, motion_rate)
+    stepped = 0.0
     keep = len(values) == 0
     likelihood = 0.0
     for n in range(len(stamp)):
@@ -239,7 +286,11 @@ def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, vari
         dts[k] = 0.0
         if last[0] >= 0:
             dt = (stamp[n] - last[0]) * 1e-9
-            phis[k] = predict(x, cov, quat, dt, jerk_density, acc_density, bias_walk)
+            if dt != stepped:
+                step, noise = motion_step(dt, motion_rate)
+                stepped = dt
+            phis[k] = predict(x, cov, quat, dt, step, noise, jerk_density, acc_density,
+                              bias_walk)
             dts[k] = dt
             if dt > max_gap:
                 flag |= GAP
@@ -267,7 +318,7 @@ def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, vari
 
 
 @njit(cache=True)
-def backward(adjoint, information, trace, is_gyro, direction, lever, smoothed, smoothed_cov):
+def backward(adjoint, information, trace, motion_rate, is_gyro, direction, lever, smoothed, smoothed_cov):
     """Modified Bryson-Frazier smoother over the n samples of a trace (Bierman 1977), in place.
 
     adjoint (n_x, 1) and information (n_x, n_x) carry on from the samples after these and end
@@ -305,9 +356,10 @@ def backward(adjoint, information, trace, is_gyro, direction, lever, smoothed, s
         part = np.ascontiguousarray(covs[n][:18])
         smoothed_cov[n] = part[:, :18] - part @ information @ part.T
         if dts[n] > 0.0:
-            turn, jac = transition(dts[n], phis[n])
-            multiply_transition_transposed(adjoint, dts[n], turn, jac)
-            multiply_transition_transposed(information, dts[n], turn, jac)
+            step, _ = motion_step(dts[n], motion_rate)
+            turn, jac = transition(phis[n])
+            multiply_transition_transposed(adjoint, dts[n], step, turn, jac)
+            multiply_transition_transposed(information, dts[n], step, turn, jac)
             half = np.ascontiguousarray(information.T)
-            multiply_transition_transposed(half, dts[n], turn, jac)
+            multiply_transition_transposed(half, dts[n], step, turn, jac)
             information[:] = 0.5 * (half + half.T)

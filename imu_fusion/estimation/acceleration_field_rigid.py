@@ -48,8 +48,8 @@ class RigidBodyFilter:
         p, l, s = self._params, self._layout, self.state
         return forward(s["x"], s["cov"], s["quat"], s["last"], stamp, readings, l.is_gyro,
                        l.direction, l.lever, l.density ** 2 * p.sample_rate, l.range,
-                       l.bias_walk, p.motion__jerk_density, p.motion__acceleration_rate_density,
-                       p.max_gap, at, fixed_at, l.reference, p.gravity, l.specific_force,
+                       l.bias_walk, p.motion__jerk_density, p.motion__rate,
+                       p.motion__acceleration_rate_density, p.max_gap, at, fixed_at, l.reference, p.gravity, l.specific_force,
                        values, flags, trace)
 
 
@@ -103,8 +103,8 @@ def _smooth_once(params, layout, start, stamp, readings, at, fixed_at):
         keeper.state = checkpoint
         part = tuple(a[:j - i] for a in trace)
         keeper.forward(stamp[i:j], readings[i:j], at[i:j], fixed_at, _NO_VALUES, _NO_FLAGS, part)
-        backward(adjoint, information, part, layout.is_gyro, layout.direction, layout.lever,
-                 mean[i:j], cov[i:j])
+        backward(adjoint, information, part, params.motion__rate, layout.is_gyro,
+                 layout.direction, layout.lever, mean[i:j], cov[i:j])
     return mean, cov
 
 
