@@ -17,7 +17,7 @@ import numpy as np
 from imu_fusion.errors import EstimationError, LayoutError, SampleError
 from imu_fusion.estimation.acceleration_field_affine import AffineFilter
 from imu_fusion.estimation.acceleration_field_layout import AccelerometerParams, make_layout
-from imu_fusion.estimation.acceleration_field_rigid import (RigidBodyFilter, fit_motion, smooth)
+from imu_fusion.estimation.acceleration_field_rigid import RigidBodyFilter, fit_densities, smooth
 from imu_fusion.estimation.acceleration_field_rows import ROW, make_rows
 from imu_fusion.estimation.acceleration_field_start import given_start, is_still, rest_start
 from imu_fusion.parameters import Parameters, flatten, param
@@ -79,8 +79,11 @@ class AccelerationFieldParams(Parameters):
     motion__acceleration_rate_density: float = param(
         3e3, unit="m/s^3/sqrt(s)", low=1e-12,
         doc="rigid_body: how fast the rate of the linear acceleration wanders.")
-    motion__maximum_likelihood: bool = param(
-        False, doc="Mode smoothed: fit both motion densities to the recording first.")
+    noise_scale: float = param(
+        1.0, low=1e-6, doc="rigid_body: factor on all noise densities, for errors of the model.")
+    maximum_likelihood: str = param(
+        "off", choices=("off", "motion", "motion_and_noise"),
+        doc="Mode smoothed: fit the motion densities (and noise_scale) to the recording first.")
     smoother__iterations: int = param(
         4, low=1, high=100, doc="Most iterations of the smoother.")
     max_gap: float = param(
@@ -138,6 +141,7 @@ class AccelerationFieldEstimator:
             raise EstimationError(f"method '{params.method}' neither smooths nor uses a gyroscope; "
                                   "use method 'rigid_body'")
         self._has_gyroscope = gyroscope is not None
+        self.fitted = params
         self.reset()
 
     @property
@@ -147,9 +151,11 @@ class AccelerationFieldEstimator:
                 else self.layout.condition_affine)
 
     def reset(self):
-        """Forget all samples and start anew."""
+        """Forget all samples and start anew; ``fitted``, what the last maximum likelihood gave,
+        stays."""
         self._filter = None
         self._start = None
+        self._rest = None
         self._last = None
         self._stamps = []
         self._readings = []
@@ -158,12 +164,12 @@ class AccelerationFieldEstimator:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else {
                     k: v.copy() for k, v in self._filter.state.items()},
-                "start": self._start, "last": self._last, "stamps": list(self._stamps),
+                "start": self._start, "rest": self._rest, "last": self._last, "stamps": list(self._stamps),
                 "readings": list(self._readings)}
 
     def set_state(self, state):
         """Go on from where :meth:`get_state` was called, in an estimator of equal parameters."""
-        self._start, self._last = state["start"], state["last"]
+        self._start, self._rest, self._last = state["start"], state["rest"], state["last"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
         self._filter = None
         if state["filter"] is not None:
@@ -210,9 +216,10 @@ class AccelerationFieldEstimator:
             return np.empty(0, ROW)
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
         params, start = self.params, self._start
-        if params.motion__maximum_likelihood:
-            params = fit_motion(params, self.layout, self._make_start, stamp, readings)
+        if params.maximum_likelihood != "off":
+            params = fit_densities(params, self.layout, self._make_start, stamp, readings)
             start = self._make_start(params)
+            self.fitted = params
         values, flags = smooth(params, self.layout, start, stamp, readings)
         self.reset()
         return make_rows(stamp, values, flags)

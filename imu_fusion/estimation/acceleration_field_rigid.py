@@ -25,6 +25,11 @@ def _trace(samples, size, channels):
             np.zeros((samples, channels)), np.zeros((samples, channels, TOUCHED)))
 
 
+def noise_variance(params, layout):
+    """Variance of one sample of each channel, (m,)."""
+    return (params.noise_scale * layout.density) ** 2 * params.sample_rate
+
+
 class RigidBodyFilter:
     """The causal extended Kalman filter: a start, then samples in order."""
 
@@ -47,7 +52,7 @@ class RigidBodyFilter:
         """The kernel with this filter's state; see the kernel for the arguments."""
         p, l, s = self._params, self._layout, self.state
         return forward(s["x"], s["cov"], s["quat"], s["last"], stamp, readings, l.is_gyro,
-                       l.direction, l.lever, l.density ** 2 * p.sample_rate, l.range,
+                       l.direction, l.lever, noise_variance(p, l), l.range,
                        l.bias_walk, p.motion__jerk_density, p.motion__rate,
                        p.motion__acceleration_rate_density, p.max_gap, at, fixed_at, l.reference, p.gravity, l.specific_force,
                        values, flags, trace)
@@ -80,7 +85,7 @@ def smooth(params, layout, start, stamp, readings):
     values = np.empty((len(stamp), VALUES))
     flags = np.zeros(len(stamp), dtype=np.uint32)
     _put_smoothed(stamp, readings, mean, cov, start[2].copy(), layout.is_gyro, layout.direction,
-                  layout.lever, layout.density ** 2 * params.sample_rate, layout.range,
+                  layout.lever, noise_variance(params, layout), layout.range,
                   params.max_gap, layout.reference, params.gravity, layout.specific_force, values,
                   flags)
     return values, flags
@@ -153,40 +158,47 @@ def log_likelihood(params, layout, start, stamp, readings):
                for i in range(0, len(stamp), _CHUNK))
 
 
-def fit_motion(params, layout, make_start, stamp, readings):
-    """Maximum likelihood of the two densities of the motion model.
+def fit_densities(params, layout, make_start, stamp, readings):
+    """Maximum likelihood of the motion model and, if asked, of a common scale of the noise.
 
     Args:
+        params: ``maximum_likelihood`` names what is fitted: ``motion`` (jerk_density,
+            acceleration_rate_density and, unless it is zero, rate) or ``motion_and_noise``
+            (noise_scale as well). Its values are where the search begins.
         make_start: function of the parameters that returns the start (its spread depends on
             the densities).
 
     Returns:
-        The parameters with both densities replaced.
+        The parameters with the fitted values.
 
     Raises:
         EstimationError: fewer than ten samples, or no maximum.
     """
     if len(stamp) < 10:
-        raise EstimationError(f"maximum likelihood of the motion: {len(stamp)} samples are too "
-                              "few, give ten or more, or set the densities")
+        raise EstimationError(f"maximum likelihood: {len(stamp)} samples are too few, give ten or "
+                              "more, or set the motion densities")
+    names = ["motion__jerk_density", "motion__acceleration_rate_density"]
+    if params.motion__rate > 0:
+        names.append("motion__rate")
+    if params.maximum_likelihood == "motion_and_noise":
+        names.append("noise_scale")
+    first = np.log([getattr(params, name) for name in names])
 
     def candidate(logs):
-        return params.replace(motion__jerk_density=float(np.exp(logs[0])),
-                              motion__acceleration_rate_density=float(np.exp(logs[1])))
+        return params.replace(**dict(zip(names, np.exp(logs).tolist())))
 
     def cost(logs):
-        if np.any(np.abs(logs) > 40):
+        if np.any(np.abs(logs - first) > 20):
             return np.inf
         chosen = candidate(logs)
         return -log_likelihood(chosen, layout, make_start(chosen), stamp, readings)
 
-    first = np.log([params.motion__jerk_density, params.motion__acceleration_rate_density])
     # Five per cent in the densities changes no estimate noticeably; half a unit of log
     # likelihood is half a standard deviation of a parameter.
     found = minimize(cost, first, method="Nelder-Mead",
-                     options={"xatol": 0.05, "fatol": 0.5, "initial_simplex": [
-                         first, first + [1.0, 0.0], first + [0.0, 1.0]]})
+                     options={"xatol": 0.05, "fatol": 0.5,
+                              "initial_simplex": np.vstack([first, first + np.eye(len(first))])})
     if not np.isfinite(found.fun):
-        raise EstimationError("maximum likelihood of the motion: no finite likelihood; check the "
-                              "units of the readings and of the noise densities")
+        raise EstimationError("maximum likelihood: no finite likelihood; check the units of the "
+                              "readings and of the noise densities")
     return candidate(found.x)

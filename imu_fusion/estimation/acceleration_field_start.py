@@ -7,7 +7,8 @@ A start is the mean x (18 + m,), the covariance and the quaternion of the state 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.acceleration_field_kernel import ACC, ALPHA, BIAS, OMEGA
+from imu_fusion.estimation.acceleration_field_kernel import (ACC, ALPHA, BIAS, OMEGA,
+                                                             motion_step)
 from imu_fusion.geometry.rotation import skew
 
 # How well the still body's kinematic acceleration is known to be zero, m/s^2.
@@ -20,11 +21,13 @@ def given_start(params, layout):
     m = len(layout.density)
     x = np.zeros(BIAS + m)
     x[OMEGA:OMEGA + 3] = params.initial__angular_velocity
-    # The Wiener processes of the model have run for a second: wide, and free of a tuned scale.
+    # The processes of the model have run for a second: wide, and free of a tuned scale.
+    _, noise = motion_step(1.0, params.motion__rate)
     jerk, acc = params.motion__jerk_density, params.motion__acceleration_rate_density
     sd = np.concatenate([
         np.full(3, params.initial__orientation_sd), np.full(3, params.initial__angular_velocity_sd),
-        np.full(6, jerk), np.full(3, acc + 10 * params.gravity), np.full(3, acc), layout.bias_sd])
+        np.full(3, jerk * np.sqrt(noise[2, 2])), np.full(3, jerk * np.sqrt(noise[3, 3])),
+        np.full(3, acc + 10 * params.gravity), np.full(3, acc), layout.bias_sd])
     return x, np.diag(sd ** 2), normalized(params.initial__orientation)
 
 
@@ -52,7 +55,8 @@ def rest_start(params, layout, readings):
     rows[acc, ACC:ACC + 3] = layout.direction[acc]
     rows[acc, ALPHA:ALPHA + 3] = np.cross(layout.lever[acc], layout.direction[acc])
     rows[layout.is_gyro, OMEGA:OMEGA + 3] = layout.direction[layout.is_gyro]
-    variance = layout.density[use] ** 2 * params.sample_rate / number[use]
+    variance = ((params.noise_scale * layout.density[use]) ** 2 * params.sample_rate
+                / number[use])
     x, cov = _update(x, cov, rows[use], mean, np.diag(variance))
     constraint = np.zeros((3, BIAS + m))
     constraint[:, ACC:ACC + 3] = np.eye(3)
@@ -77,7 +81,7 @@ def is_still(params, layout, readings):
     use = np.isfinite(seen).sum(axis=0) > 1
     if not np.any(use):
         return False
-    noise = layout.density * np.sqrt(params.sample_rate)
+    noise = params.noise_scale * layout.density * np.sqrt(params.sample_rate)
     limit = np.where(layout.is_gyro, params.initial__angular_velocity_sd,
                      params.initial__still_sd) + 2 * noise
     return bool(np.all(np.nanstd(seen[:, use], axis=0) < limit[use]))
@@ -92,11 +96,11 @@ def normalized(quat):
 def _level(up, quat):
     """The orientation nearest to ``quat`` in which the body direction ``up`` points up."""
     pointing = Rotation.from_quat(quat).apply(up)
-    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [pointing])
     axis = np.cross(pointing, [0.0, 0.0, 1.0])
-    sine, cosine = np.linalg.norm(axis), pointing[2]
-    if sine > 1e-9:
-        turn = Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))
+    sine = np.linalg.norm(axis)
+    # Upside down, every horizontal axis is as near as any other.
+    axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+    turn = Rotation.from_rotvec(axis * np.arctan2(sine, pointing[2]))
     return (turn * Rotation.from_quat(quat)).as_quat()
 
 
