@@ -136,6 +136,8 @@ class AccelerationFieldEstimator:
         sensors = accelerometers.values() if hasattr(accelerometers, "values") else accelerometers
         self.params = params
         self.layout = make_layout(tuple(sensors), gyroscope)
+        if params.method != "rigid_body":
+            self.layout = self.layout.for_affine_fit(params.max_condition)
         self.layout.require(params.method, params.max_condition)
         if params.method != "rigid_body" and (params.mode == "smoothed" or gyroscope is not None):
             raise EstimationError(f"method '{params.method}' neither smooths nor uses a gyroscope; "

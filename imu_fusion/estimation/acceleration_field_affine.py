@@ -96,12 +96,12 @@ def _rotation(dt, omega0, omega1, alpha0, alpha1, high_order):
 
 @njit(cache=True)
 def _grow(cov, dt, phi, cov_alpha):
-    """Covariance (6, 6) of attitude and omega error over a step with white alpha errors."""
+    """Covariance of attitude and omega (the first six of cov) over a step, white alpha errors."""
     f = np.eye(6)
     f[:3, :3] = quat_to_matrix(quat_exp(phi)).T
     f[:3, 3:] = dt * right_jacobian(phi)
-    cov[:] = f @ cov @ f.T
-    cov[3:, 3:] += dt * dt * cov_alpha
+    cov[:6, :6] = f @ cov[:6, :6].copy() @ f.T
+    cov[3:6, 3:6] += dt * dt * cov_alpha
 
 
 @njit(cache=True)
@@ -110,7 +110,8 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
             values, flags):
     """Take samples in order; one row of values and flags each.
 
-    state: (27,), cov: (6, 6) of attitude and omega, last: (1,) int64 stamp, all in place.
+    state: (27,), cov: (18, 18) as in the rigid-body kernel but for alpha and a of the latest fit
+    alone, last: (1,) int64 stamp, all in place.
     readings: (n, m) channels, NaN for missing and inf for saturated ones. design: (m, 12), its columns multiplied
     by scale (12,).
     """
@@ -121,7 +122,6 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
     whole = used.copy()
     current = used.copy()
     x = np.zeros(18)
-    joint = np.zeros((18, 18))
     for n in range(len(stamp)):
         flag = 0
         for c in range(m):
@@ -164,7 +164,7 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
             flag |= HELD
             fit = np.zeros(12)
             alpha = state[ALPHA:ALPHA + 3].copy()
-            cov_alpha = joint[6:9, 6:9].copy()
+            cov_alpha = cov[6:9, 6:9].copy()
         symmetric = np.zeros((3, 3))
         for i in range(3):
             j, k = min((i + 1) % 3, (i + 2) % 3), max((i + 1) % 3, (i + 2) % 3)
@@ -193,8 +193,8 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
                     j, k = (i + 1) % 3, (i + 2) % 3
                     gradient[k, j] += alpha[i]
                     gradient[j, k] -= alpha[i]
-            joint[12:15, 12:15] = covariance[0:3, 0:3]
-            joint[6:9, 6:9] = cov_alpha
+            cov[12:15, 12:15] = covariance[0:3, 0:3]
+            cov[6:9, 6:9] = cov_alpha
         else:
             acc = state[ACC:ACC + 3].copy()
             gradient = rigid_gradient(omega, alpha)
@@ -209,8 +209,7 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
         x[3:6] = omega
         x[6:9] = alpha
         x[12:15] = acc
-        joint[0:6, 0:6] = cov
-        put_row(values[n], gradient, x, joint, state[QUAT:QUAT + 4], reference, gravity,
+        put_row(values[n], gradient, x, cov, state[QUAT:QUAT + 4], reference, gravity,
                 specific_force, residual)
         flags[n] = flag
 
@@ -227,8 +226,8 @@ def _set_rate_covariance(cov, omega, covariance, scale):
         largest = max(largest, covariance[i, i] * scale[i] * scale[i])
     speed2 = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
     variance = largest / (4.0 * max(speed2, 0.5 * math.sqrt(largest)))
-    cov[3:, :] = 0.0
-    cov[:3, 3:] = 0.0
+    cov[3:6, :6] = 0.0
+    cov[:6, 3:6] = 0.0
     for i in range(3):
         cov[3 + i, 3 + i] = variance
 
@@ -246,8 +245,9 @@ class AffineFilter:
         state = np.zeros(STATE)
         state[QUAT:QUAT + 4] = quat
         state[RATE:RATE + 3] = x[3:6]
-        self.state = {"state": state, "cov": cov[:6, :6].copy(),
+        self.state = {"state": state, "cov": np.zeros((18, 18)),
                       "last": np.array([-1], dtype=np.int64)}
+        self.state["cov"][:6, :6] = cov[:6, :6]
 
     def process(self, stamp, readings):
         """Rows' values (n, 71) and flags (n,) of samples: stamp (n,), readings (n, m)."""

@@ -225,7 +225,7 @@ def scalar_update(x, cov, index, h, count, innovation, variance, column):
 
 
 @njit(cache=True)
-def update(x, cov, quat, reading, is_gyro, direction, lever, variance, ranges, at, trace_column,
+def update(x, cov, reading, is_gyro, direction, lever, variance, ranges, at, trace_column,
            trace_total, trace_innovation, trace_row):
     """All channels of one sample, linearised at the angular velocity ``at`` (3,), in place.
 
@@ -257,8 +257,6 @@ def update(x, cov, quat, reading, is_gyro, direction, lever, variance, ranges, a
         squares += innovation * innovation / total
         log_likelihood -= 0.5 * (math.log(2.0 * math.pi * total) + innovation * innovation / total)
         used += 1
-    quat[:] = quat_normalize(quat_multiply(quat, quat_exp(x[0:3])))
-    x[0:3] = 0.0
     return squares, log_likelihood, used, flag
 
 
@@ -295,14 +293,16 @@ def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, vari
             if dt > max_gap:
                 flag |= GAP
         last[0] = stamp[n]
+        where = at[n].copy() if fixed_at else x[3:6].copy()
+        squares, log_likelihood, used, seen = update(
+            x, cov, readings[n], is_gyro, direction, lever, variance, ranges, where,
+            columns[k], totals[k], innovations[k], rows[k])
+        likelihood += log_likelihood
         if keep:
             xs[k] = x
             covs[k] = cov
-        where = at[n].copy() if fixed_at else x[3:6].copy()
-        squares, log_likelihood, used, seen = update(
-            x, cov, quat, readings[n], is_gyro, direction, lever, variance, ranges, where,
-            columns[k], totals[k], innovations[k], rows[k])
-        likelihood += log_likelihood
+        quat[:] = quat_normalize(quat_multiply(quat, quat_exp(x[0:3])))
+        x[0:3] = 0.0
         if not keep:
             flag |= seen
             residual = math.nan
@@ -331,6 +331,11 @@ def backward(adjoint, information, trace, motion_rate, is_gyro, direction, lever
     index = np.empty(TOUCHED, np.int64)
     unused = np.empty(TOUCHED)
     for n in range(len(xs) - 1, -1, -1):
+        # With the filtered covariance rather than the predicted one: the difference of two
+        # small numbers keeps the digits that a wide prior would cost.
+        smoothed[n] = xs[n] - (covs[n] @ adjoint)[:, 0]
+        part = np.ascontiguousarray(covs[n][:18])
+        smoothed_cov[n] = part[:, :18] - part @ information @ part.T
         for c in range(totals.shape[1] - 1, -1, -1):
             total = totals[n, c]
             if total == 0.0:
@@ -352,9 +357,6 @@ def backward(adjoint, information, trace, motion_rate, is_gyro, direction, lever
             for k in range(count):
                 for l in range(count):
                     information[index[k], index[l]] += row[k] * row[l] * quadratic
-        smoothed[n] = xs[n] - (covs[n] @ adjoint)[:, 0]
-        part = np.ascontiguousarray(covs[n][:18])
-        smoothed_cov[n] = part[:, :18] - part @ information @ part.T
         if dts[n] > 0.0:
             step, _ = motion_step(dts[n], motion_rate)
             turn, jac = transition(phis[n])

@@ -9,7 +9,7 @@ point (the weighted centre of the accelerometers), its reading along the unit ve
 accelerometers that are not coplanar determine all twelve; fewer channels may determine some.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from imu_fusion.parameters import Parameters, param
 
 # Order of the six numbers of the symmetric part: xx yy zz xy xz yz.
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-# Coordinate accelerations and specific forces differ by gravity and must not be mixed.
 _AXIS_NAMES = ("x", "y", "z")
 
 
@@ -105,6 +104,19 @@ class Layout:
         _, values, rows = np.linalg.svd(matrix)
         free = rows[np.sum(values > values[0] / max_condition):]
         return bool(np.all(np.abs(free[:, :6]) < 1.0 / max_condition))
+
+    def for_affine_fit(self, max_condition):
+        """This layout with a reference point at which the fit determines a and alpha.
+
+        Where S is not determined entirely, as in the nine-accelerometer package, that is one of
+        the positions rather than the centre. Unchanged if there is no such point.
+        """
+        places = self.lever[~self.is_gyro]
+        for place in np.vstack([np.zeros(3), places]):
+            moved = replace(self, reference=self.reference + place, lever=self.lever - place)
+            if moved.determines_alpha(max_condition):
+                return moved
+        return self
 
     def require(self, method, max_condition):
         """Refuse a layout that ``method`` cannot use.

@@ -106,7 +106,8 @@ def _level(up, quat):
 
 def _update(x, cov, rows, reading, noise):
     total = rows @ cov @ rows.T + noise
-    gain = np.linalg.solve(total, rows @ cov).T
+    # Least squares, since precise sensors without biases make the total singular in float64.
+    gain = np.linalg.lstsq(total, rows @ cov, rcond=1e-13)[0].T
     x = x + gain @ (reading - rows @ x)
     reduce = np.eye(len(x)) - gain @ rows
     return x, reduce @ cov @ reduce.T + gain @ noise @ gain.T
