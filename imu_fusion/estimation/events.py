@@ -1,0 +1,180 @@
+"""Take-off and touch-down of a ski jump, and what is read off the jump."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError
+
+_MIN_SPEED = 10.0   # m/s, Fang 2020, appendix A
+_SEPARATION = 1.5   # s between the two peaks, ibid.
+_LEAD = 0.05        # s by which touch-down precedes the second peak, ibid.
+
+
+@dataclass(frozen=True)
+class JumpEvents:
+    """Stamps of take-off and touch-down, ns."""
+
+    takeoff: int
+    touchdown: int
+
+
+def detect_jump(imu, velocity):
+    """Take-off and touch-down from peaks of the specific force (Fang 2020, appendix A).
+
+    Args:
+        imu: ImuLog.
+        velocity: VelocityLog; its speed limits the search to the fast part.
+
+    Returns:
+        JumpEvents.
+
+    Raises:
+        EstimationError: no fast part, or no two peaks.
+    """
+    if velocity is None or len(velocity) < 2:
+        raise EstimationError("take-off and touch-down cannot be detected without GNSS "
+                              "velocities: give the events")
+    origin = imu.stamp[0]
+    speed = np.interp(imu.stamp - origin, velocity.stamp - origin,
+                      np.linalg.norm(velocity.vel_world, axis=1))
+    force = np.linalg.norm(imu.acc, axis=1)
+    fast = (speed > _MIN_SPEED) & np.isfinite(force)
+    if not fast.any():
+        raise EstimationError(f"no take-off: the speed never exceeds {_MIN_SPEED:g} m/s")
+    candidates = np.where(fast, force, -np.inf)
+    first = int(np.argmax(candidates))
+    # (A2), with the sense of the inequality that the text describes.
+    apart = np.abs(imu.stamp - imu.stamp[first]) > _SEPARATION * 1e9
+    candidates[~apart] = -np.inf
+    second = int(np.argmax(candidates))
+    if not np.isfinite(candidates[second]):
+        raise EstimationError("no take-off and touch-down: only one peak of the specific force "
+                              "at speed")
+    early, late = sorted((int(imu.stamp[first]), int(imu.stamp[second])))
+    return JumpEvents(early, late - int(_LEAD * 1e9))
+
+
+def impact_onset(imu, touchdown, before=0.4, after=0.35):
+    """Stamp at which the force of the impact sets in, near a first guess.
+
+    The specific force in the air varies slowly; the impact is the first sample that leaves
+    its trend for good. Through it and its two successors runs a parabola, whose root dates
+    the onset, between the last quiet sample and the first loud one.
+
+    Args:
+        imu: ImuLog.
+        touchdown: first guess, ns.
+        before, after: s searched around it.
+
+    Returns:
+        Stamp (ns) and its standard deviation (s), or None when nothing stands out.
+    """
+    window = imu.between(touchdown - int(before * 1e9), touchdown + int(after * 1e9))
+    if len(window) < 12:
+        return None
+    t = (window.stamp - window.stamp[0]) * 1e-9
+    peak = int(np.argmax(np.linalg.norm(window.acc, axis=1)))
+    quiet = max(int(0.4 * peak), 5)
+    trend = np.polynomial.polynomial.polyfit(t[:quiet], window.acc[:quiet], 1)
+    deviation = np.linalg.norm(
+        window.acc - np.polynomial.polynomial.polyval(t, trend).T, axis=1)
+    floor = max(np.median(deviation[:quiet]) * 6.0, 0.05 * deviation[peak])
+    loud = np.flatnonzero(deviation[:peak + 1] <= floor)
+    if not len(loud) or loud[-1] + 3 >= len(t):
+        return None
+    i = int(loud[-1]) + 1
+    step = t[i] - t[i - 1]
+    curve = np.polynomial.Polynomial.fit(t[i:i + 3], deviation[i:i + 3], 2).convert()
+    roots = curve.roots()
+    roots = roots[np.isreal(roots)].real
+    roots = roots[roots <= t[i]]
+    onset = np.clip(roots.max() if len(roots) else t[i] - 0.5 * step, t[i - 1], t[i])
+    return int(window.stamp[0] + round(onset * 1e9)), step / np.sqrt(12.0)
+
+
+def _interpolate(stamp, samples, name):
+    since = samples["stamp"] - samples["stamp"][0]
+    at = stamp - samples["stamp"][0]
+    return np.array([np.interp(at, since, column) for column in samples[name].T])
+
+
+def table_crossing(hill, samples, near):
+    """Stamp (ns) at which the smoothed trajectory passes the table edge (x = 0), near a first
+    guess; None when it does not within 2 s."""
+    around = np.abs(samples["stamp"] - near) < 2_000_000_000
+    stamp = samples["stamp"][around]
+    x = hill.to_hill(samples["position_world"][around])[:, 0]
+    crossing = np.flatnonzero((x[:-1] < 0) & (x[1:] >= 0))
+    if not len(crossing):
+        return None
+    i = int(crossing[0])
+    return int(stamp[i] + round((stamp[i + 1] - stamp[i]) * float(-x[i] / (x[i + 1] - x[i]))))
+
+
+def refine_jump(hill, samples, imu, events):
+    """Events from the smoothed trajectory (take-off: the table edge) and the onset of the
+    impact (touch-down); the given ones where these fail."""
+    takeoff = table_crossing(hill, samples, events.takeoff)
+    onset = impact_onset(imu, events.touchdown)
+    return JumpEvents(events.takeoff if takeoff is None else takeoff,
+                      events.touchdown if onset is None else onset[0])
+
+
+@dataclass(frozen=True)
+class JumpResult:
+    """What is reported of a jump: m, m/s, degrees, s."""
+
+    takeoff_stamp: int
+    touchdown_stamp: int
+    in_run_speed: float
+    takeoff_speed: float
+    takeoff_angle_deg: float
+    flight_time: float
+    length: float
+    length_sd: float
+    landing_speed: float
+
+    def to_mapping(self):
+        """Names and values, for JSON and CSV."""
+        return asdict(self)
+
+
+def jump_result(hill, samples, imu, events):
+    """Read the results of a jump off the smoothed samples.
+
+    The length is that of the landing profile up to the touch-down; its standard deviation
+    joins the position's along the profile and the date's times the speed. The take-off angle
+    is that of the velocity at the edge, upwards positive; the in-run speed is the mean over
+    the last 10 m of the table side, as light barriers measure it.
+
+    Args:
+        hill: Hill.
+        samples: structured array of the smoother.
+        imu: ImuLog.
+        events: JumpEvents.
+    """
+    takeoff = _interpolate(events.takeoff, samples, "vel_world")
+    landing = _interpolate(events.touchdown, samples, "vel_world")
+    x, _, _ = hill.to_hill(_interpolate(events.touchdown, samples, "position_world"))
+    slope = float(hill.landing(x)[1])
+    i = int(np.searchsorted(samples["stamp"], events.touchdown))
+    i = min(i, len(samples) - 1)
+    cov = hill.axes @ samples["cov_position"][i] @ hill.axes.T
+    # On the profile dL = sqrt(1 + slope^2) dx.
+    stretch = np.hypot(1.0, slope)
+    onset = impact_onset(imu, events.touchdown)
+    timing = onset[1] if onset is not None else _LEAD
+    forward = float(hill.to_hill(landing)[0])
+    x_hill = hill.to_hill(samples["position_world"])[:, 0]
+    table = (samples["stamp"] < events.takeoff) & (x_hill > -10.0)
+    speed = np.linalg.norm(samples["vel_world"], axis=1)
+    return JumpResult(
+        takeoff_stamp=events.takeoff, touchdown_stamp=events.touchdown,
+        in_run_speed=float(speed[table].mean()) if table.any() else float("nan"),
+        takeoff_speed=float(np.linalg.norm(takeoff)),
+        takeoff_angle_deg=float(np.degrees(np.arctan2(takeoff[2], np.hypot(*takeoff[:2])))),
+        flight_time=(events.touchdown - events.takeoff) * 1e-9,
+        length=float(hill.jump_length(x)),
+        length_sd=float(stretch * np.sqrt(cov[0, 0] + (timing * forward) ** 2)),
+        landing_speed=float(np.linalg.norm(landing)))

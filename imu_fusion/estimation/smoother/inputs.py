@@ -1,0 +1,198 @@
+"""From logs to the arrays of the kernel: gaps bridged, saturation flagged, measurements
+attached to samples and whitened, constraints evaluated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError, SampleError
+from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
+from imu_fusion.samples.logs import ImuLog
+
+_MICRO = 1e6  # magnetic states and rows are kept in microtesla, near one in size
+
+
+@dataclass(frozen=True)
+class ImuInput:
+    """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped_gyr`` (N,) the
+    rates out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
+
+    log: ImuLog
+    recorded: np.ndarray
+    clipped_gyr: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def steps(self):
+        """dt (N - 1,) s."""
+        return np.diff(self.log.stamp) * 1e-9
+
+    @property
+    def means(self):
+        """Mean rates and forces of the intervals (N - 1, 6)."""
+        both = np.concatenate([self.log.gyr, self.log.acc], axis=1)
+        return 0.5 * (both[1:] + both[:-1])
+
+
+def prepare_imu(imu, params):
+    """Check the Imu samples, bridge gaps, flag what was clipped.
+
+    Samples that are not finite are left out, and so is the second of two with one stamp.
+
+    Raises:
+        SampleError: stamps that go backwards, fewer than ten samples.
+    """
+    back = np.flatnonzero(np.diff(imu.stamp) < 0)
+    if len(back):
+        raise SampleError(f"Imu stamps go backwards after {imu.stamp[back[0]]} ns: sort the "
+                          "recording or cut it there")
+    good = np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1)
+    good[1:] &= np.diff(imu.stamp) > 0
+    imu = imu[good]
+    if len(imu) < 10:
+        raise SampleError(f"{len(imu)} usable Imu samples: the smoother needs at least 10")
+    steps = np.diff(imu.stamp)
+    nominal = int(np.median(steps))
+    gaps = np.flatnonzero(steps > max(params.max_gap * 1e9, 1.5 * nominal))
+    recorded = np.ones(len(imu), bool)
+    if len(gaps):
+        extra = [np.arange(imu.stamp[g] + nominal, imu.stamp[g + 1] - nominal // 2, nominal)
+                 for g in gaps]
+        added = np.concatenate(extra)
+        stamp = np.concatenate([imu.stamp, added])
+        order = np.argsort(stamp, kind="stable")
+        recorded = np.concatenate([recorded, np.zeros(len(added), bool)])[order]
+        since = stamp[order] - imu.stamp[0]
+        columns = [np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v[:, i])
+                                    for i in range(3)]) for v in (imu.gyr, imu.acc)]
+        imu = ImuLog(stamp=stamp[order], gyr=columns[0], acc=columns[1], frame_id=imu.frame_id)
+    sides = []
+    clipped_gyr = np.zeros(len(imu), bool)
+    for values, limit, density, unknown in (
+            (imu.gyr, params.gyr_range, params.gyr_noise_density, params.unknown_gyr_density),
+            (imu.acc, params.acc_range, params.acc_noise_density, params.unknown_acc_density)):
+        lost = np.repeat(~recorded[:, None], 3, axis=1)
+        if limit > 0.0:
+            # One part in a thousand below the limit: rounding of logged full-scale values.
+            lost |= np.abs(values) >= 0.999 * limit
+            if values is imu.gyr:
+                clipped_gyr = lost.any(axis=1) & recorded
+        either = lost[1:] | lost[:-1]
+        sides.append(np.where(either, unknown, density) ** 2)
+    return ImuInput(imu, recorded, clipped_gyr, np.concatenate(sides, axis=1))
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """GNSS and magnetometer readings with whitening matrices; sorted when attached."""
+
+    stamp: np.ndarray
+    kind: np.ndarray
+    value: np.ndarray
+    whiten: np.ndarray
+    loss: np.ndarray
+
+    def attach(self, imu_stamp, time_offset):
+        """Bind each reading to the sample before it.
+
+        Args:
+            imu_stamp: (N,) ns.
+            time_offset: s by which GNSS stamps are late.
+
+        Returns:
+            order (m,) of the readings used, start (N + 1,), tau (m,) s after the sample.
+        """
+        late = np.int64(round(time_offset * 1e9))
+        stamp = self.stamp - np.where(self.kind == MAG, 0, late)
+        inside = (stamp >= imu_stamp[0]) & (stamp <= imu_stamp[-1])
+        order = np.flatnonzero(inside)
+        order = order[np.lexsort((self.kind[order], stamp[order]))]
+        sample = np.searchsorted(imu_stamp, stamp[order], side="right") - 1
+        sample = np.minimum(sample, len(imu_stamp) - 2)
+        start = np.searchsorted(sample, np.arange(len(imu_stamp) + 1))
+        return order, start, (stamp[order] - imu_stamp[sample]) * 1e-9
+
+
+def _covariances(given, default_sd, what):
+    """Covariances (m, 3, 3): the default where all zeros.
+
+    Raises:
+        SampleError: a covariance that is not positive definite.
+    """
+    cov = given.copy()
+    cov[~np.any(cov, axis=(1, 2))] = np.diag(np.square(default_sd))
+    try:
+        return np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        raise SampleError(f"a covariance of {what} is not positive definite") from None
+
+
+def prepare_measurements(frame, mag, fix, velocity, params):
+    """All readings as :class:`Measurements`; those that are not finite are left out.
+
+    Raises:
+        EstimationError: no fix at all.
+    """
+    parts = []
+    if fix is not None:
+        fix = fix[(fix.status >= 0) & np.isfinite(fix.latitude_deg)
+                  & np.isfinite(fix.longitude_deg) & np.isfinite(fix.height)]
+    if fix is None or len(fix) == 0:
+        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
+                              "alone is the job of the orientation estimator")
+    eye = np.eye(3)
+    root = _covariances(fix.cov_enu, params.fix_sd, "the fixes")
+    parts.append((fix.stamp, FIX, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
+                  root, params.fix_loss_scale))
+    if velocity is not None:
+        velocity = velocity[np.isfinite(velocity.vel_world).all(axis=1)]
+        root = _covariances(velocity.cov_world, params.velocity_sd, "the velocities")
+        parts.append((velocity.stamp, VELOCITY, velocity.vel_world, root, params.fix_loss_scale))
+    if mag is not None:
+        mag = mag[np.isfinite(mag.mag).all(axis=1)]
+        root = np.broadcast_to(params.mag_sd * _MICRO * eye, (len(mag), 3, 3))
+        parts.append((mag.stamp, MAG, mag.mag * _MICRO, root, params.mag_loss_scale))
+    whiten = np.concatenate([np.linalg.inv(p[3]) for p in parts])
+    return Measurements(
+        stamp=np.concatenate([p[0] for p in parts]),
+        kind=np.concatenate([np.full(len(p[0]), p[1]) for p in parts]),
+        value=np.concatenate([p[2] for p in parts]), whiten=np.tril(whiten),
+        loss=np.concatenate([np.full(len(p[0]), p[4] ** 2) for p in parts]))
+
+
+def evaluate_constraints(constraints, position_world, stamp, events, margin):
+    """Rows of all constraints on the samples where they hold.
+
+    Args:
+        constraints: of the surface.
+        position_world: (N, 3) m, in the frame of the surface.
+        stamp: (N,) ns.
+        events: take-off and touch-down, or None when no constraint needs them.
+        margin: s around the events without constraint.
+
+    Returns:
+        start (N + 1,), residual (r,), gradient (r, 3), sigma (r,), height (r,).
+    """
+    pieces = []
+    late = np.int64(round(margin * 1e9))
+    for constraint in constraints:
+        active = np.ones(len(stamp), bool)
+        if constraint.phase == "in_run":
+            active = stamp <= events.takeoff - late
+        elif constraint.phase == "landing":
+            active = stamp >= events.touchdown + late
+        sample = np.flatnonzero(active)
+        if not len(sample):
+            continue
+        residual, gradient = constraint.evaluate(position_world[sample])
+        keep = np.isfinite(residual)
+        pieces.append((sample[keep], residual[keep], gradient[keep],
+                       np.full(keep.sum(), constraint.sigma),
+                       np.full(keep.sum(), constraint.height)))
+    if not pieces:
+        return (np.zeros(len(stamp) + 1, np.int64), np.empty(0), np.empty((0, 3)), np.empty(0),
+                np.empty(0, bool))
+    sample, *columns = (np.concatenate(c) for c in zip(*pieces))
+    order = np.argsort(sample, kind="stable")
+    start = np.searchsorted(sample[order], np.arange(len(stamp) + 1))
+    return start, *(np.ascontiguousarray(c[order]) for c in columns)

@@ -1,0 +1,506 @@
+"""Forward filter and inverse-free backward pass over a linearised trajectory (numba).
+
+The forward pass is a Kalman filter of the deviation from a nominal trajectory, with
+scalar updates of whitened rows. The backward pass is the modified Bryson-Frazier form
+(Bierman, *Factorization Methods for Discrete Sequential Estimation*, ch. X): an adjoint
+vector and matrix run backwards, and neither needs a covariance to be inverted, so
+singular process noise and exactly known states do no harm.
+
+Memory: the filter keeps the deviation and covariance at the first sample of each
+segment only; the backward pass runs each segment forward once more to get what it
+needs. Both runs execute the same operations, so they agree bit for bit.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from imu_fusion.estimation.smoother.model import (ATT, BODY_HEIGHT, FIX, LEVER_ARM, POS, VEL,
+                                                  VELOCITY, interval, predict_fix, predict_mag,
+                                                  predict_velocity)
+from imu_fusion.geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+
+#: Longest list of non-zero entries of a measurement row.
+MAX_ENTRIES = 24
+
+#: Samples kept at once by the backward pass.
+SEGMENT = 128
+
+#: Variances of the slow states are computed for every so many samples.
+THINNING = 16
+
+
+@njit(cache=True)
+def boxplus(x, delta):
+    """State x (n + 1,) moved by an error state delta (n,), in place."""
+    turned = quat_multiply(x[6:10], quat_exp(delta[ATT:ATT + 3]))
+    turned /= math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2 + turned[3] ** 2)
+    x[6:10] = turned
+    for i in range(6):
+        x[i] += delta[i]
+    for i in range(9, len(delta)):
+        x[i + 1] += delta[i]
+
+
+@njit(cache=True)
+def boxminus(a, b, out):
+    """out (n,) with a = b [+] out, for states a, b (n + 1,)."""
+    out[ATT:ATT + 3] = quat_log(quat_multiply(quat_conjugate(b[6:10]), a[6:10]))
+    for i in range(6):
+        out[i] = a[i] - b[i]
+    for i in range(9, len(out)):
+        out[i] = a[i + 1] - b[i + 1]
+
+
+@njit(cache=True)
+def _propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
+    """out = F @ m for a matrix m (n, k)."""
+    n, width = m.shape
+    for i in range(3):
+        for j in range(width):
+            out[VEL + i, j] = m[VEL + i, j]
+            out[ATT + i, j] = 0.0
+        for c in columns:
+            v, a = f_vel[i, c], f_att[i, c]
+            for j in range(width):
+                out[VEL + i, j] += v * m[c, j]
+            if a != 0.0:
+                for j in range(width):
+                    out[ATT + i, j] += a * m[c, j]
+        for j in range(width):
+            out[POS + i, j] = m[POS + i, j] + 0.5 * dt * (m[VEL + i, j] + out[VEL + i, j])
+    for i in range(9, n):
+        for j in range(width):
+            out[i, j] = decay[i] * m[i, j]
+
+
+@njit(cache=True)
+def _adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
+    """out = F.T @ m for a matrix m (n, k)."""
+    n, width = m.shape
+    for i in range(3):
+        for j in range(width):
+            out[POS + i, j] = m[POS + i, j]
+            out[VEL + i, j] = m[VEL + i, j] + dt * m[POS + i, j]
+            out[ATT + i, j] = 0.0
+    for i in range(9, n):
+        for j in range(width):
+            out[i, j] = decay[i] * m[i, j]
+    for i in range(3):
+        for c in columns:
+            v, a = f_vel[i, c], f_att[i, c]
+            for j in range(width):
+                out[c, j] += v * (m[VEL + i, j] + 0.5 * dt * m[POS + i, j])
+            if a != 0.0:
+                for j in range(width):
+                    out[c, j] += a * m[ATT + i, j]
+
+
+@njit(cache=True)
+def _interval_noise(q_acc, middle, dt, spread):
+    """spread (3, 3): covariance of the velocity step in world axes."""
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] = dt * (middle[i, 0] * middle[j, 0] * q_acc[0]
+                                 + middle[i, 1] * middle[j, 1] * q_acc[1]
+                                 + middle[i, 2] * middle[j, 2] * q_acc[2])
+
+
+@njit(cache=True)
+def _slow_noise(walk, rate, dt, factor):
+    """Variance that a slow state gains; factor is its decay over dt."""
+    return walk * dt if rate == 0.0 else 0.5 * walk / rate * (1.0 - factor * factor)
+
+
+@njit(cache=True)
+def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, innovation,
+                   store, storage):
+    """Filter samples first <= k < last; ``delta`` and ``cov`` are those before the rows of
+    ``first`` on entry, before the rows of ``last`` on return.
+
+    Args:
+        follow: the nominal trajectory follows the filter (extended Kalman filter, writes x)
+            instead of being kept (linear pass about x).
+        x: nominal states (N, n + 1).
+        motion: steps dt (N - 1,) s; means of gyr and acc (N - 1, 6); their noise variance
+            densities (N - 1, 6); gravity; decay rates (n,) and walk variance densities (n,) of
+            the slow states; layout; columns of the transition matrix in use; magnetic field
+            (3,); lever arm (3,).
+        measured: sorted by sample: start (N + 1,), kind, tau, value (M, 3), whitening matrix
+            (M, 3, 3), squared scale of the robust loss (0: squared loss).
+        rows: constraints sorted by sample: start (N + 1,), residual, gradient, sigma, height.
+        innovation: (M, 3) normalised innovations, result.
+        store: whether to fill ``storage`` for the backward pass: entries, indices, count, gain,
+            value and start of the rows; deviation and covariance after the rows.
+
+    Returns:
+        Sum of the losses of all rows at the nominal trajectory.
+    """
+    stamps, inputs, noise, gravity, rates, walks, layout, columns, field, lever_arm = motion
+    m_start, m_kind, m_tau, m_value, m_whiten, m_loss = measured
+    c_start, c_residual, c_gradient, c_sigma, c_height = rows
+    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
+    n = len(delta)
+    n_total = len(x)
+    f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
+    x_next, rate, force = np.empty(n + 1), np.empty(3), np.empty(3)
+    rotation, middle, spread = np.eye(3), np.eye(3), np.empty((3, 3))
+    decay, work, work_t = np.ones(n), np.empty((n, n)), np.empty((n, n))
+    column, column_out, defect = np.empty((n, 1)), np.empty((n, 1)), np.empty(n)
+    h, row, gain, residual = np.zeros((3, n)), np.zeros(n), np.empty(n), np.empty(3)
+    entries, used = np.empty(MAX_ENTRIES), np.empty(MAX_ENTRIES, np.int64)
+    lever = lever_arm.copy()
+    cost, dt = 0.0, 0.0
+    n_rows = 0
+    for k in range(first, last):
+        has_interval = k < n_total - 1
+        if has_interval:
+            dt = stamps[k]
+            for i in range(9, n):
+                decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
+            rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, decay,
+                                        layout, f_vel, f_att, x_next, rate, force)
+        if layout[LEVER_ARM] >= 0:
+            for i in range(3):
+                lever[i] = x[k, layout[LEVER_ARM] + 1 + i]
+        if store:
+            r_start[k - first] = n_rows
+        for m in range(m_start[k], m_start[k + 1]):
+            h[:] = 0.0
+            kind, tau = m_kind[m], m_tau[m]
+            if kind == FIX:
+                predicted = predict_fix(x[k], tau, rate, force, rotation, lever, layout, h)
+            elif kind == VELOCITY:
+                predicted = predict_velocity(x[k], tau, dt, rate, force, rotation, f_vel, lever,
+                                             layout, h)
+            else:
+                predicted = predict_mag(x[k], tau, rate, rotation, field, layout, h)
+            # Whitening keeps the rows of one measurement independent.
+            squares = 0.0
+            for i in range(3):
+                residual[i] = 0.0
+                for j in range(i + 1):
+                    residual[i] += m_whiten[m, i, j] * (m_value[m, j] - predicted[j])
+            for i in range(2, -1, -1):
+                for c in range(n):
+                    total = 0.0
+                    for j in range(i + 1):
+                        total += m_whiten[m, i, j] * h[j, c]
+                    h[i, c] = total
+            for i in range(3):
+                scale = 1.0
+                if follow:
+                    # The filter judges an outlier by what it expects, not by the noise alone.
+                    for a in range(n):
+                        if h[i, a] != 0.0:
+                            for b in range(n):
+                                scale += h[i, a] * cov[a, b] * h[i, b]
+                squares += residual[i] * residual[i] / scale
+            weight = 1.0
+            if m_loss[m] > 0.0:
+                weight = 1.0 / math.sqrt(1.0 + squares / m_loss[m])
+                cost += m_loss[m] * math.log(1.0 + squares / m_loss[m])
+            else:
+                cost += squares
+            for i in range(3):
+                count = 0
+                for c in range(n):
+                    if h[i, c] != 0.0:
+                        entries[count] = weight * h[i, c]
+                        used[count] = c
+                        count += 1
+                value, root = _update(delta, cov, entries, used, count,
+                                      weight * residual[i], gain)
+                innovation[m, i] = value
+                if store:
+                    _store_row(n_rows, entries, used, count, gain, value, root, r_entries,
+                               r_index, r_count, r_gain, r_value)
+                    n_rows += 1
+        for c in range(c_start[k], c_start[k + 1]):
+            count = 0
+            gap = -c_residual[c]
+            for i in range(3):
+                if c_gradient[c, i] != 0.0:
+                    entries[count] = c_gradient[c, i] / c_sigma[c]
+                    used[count] = POS + i
+                    count += 1
+            if c_height[c] and layout[BODY_HEIGHT] >= 0:
+                gap += x[k, layout[BODY_HEIGHT] + 1]
+                entries[count] = -1.0 / c_sigma[c]
+                used[count] = layout[BODY_HEIGHT]
+                count += 1
+            cost += (gap / c_sigma[c]) ** 2
+            value, root = _update(delta, cov, entries, used, count, gap / c_sigma[c], gain)
+            if store:
+                _store_row(n_rows, entries, used, count, gain, value, root, r_entries,
+                           r_index, r_count, r_gain, r_value)
+                n_rows += 1
+        if follow:
+            boxplus(x[k], delta)
+            delta[:] = 0.0
+            if has_interval:
+                rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity,
+                                            decay, layout, f_vel, f_att, x_next, rate, force)
+        if store:
+            r_start[k - first + 1] = n_rows
+            s_delta[k - first] = delta
+            s_cov[k - first] = cov
+        if not has_interval:
+            continue
+        if follow:
+            x[k + 1] = x_next
+        else:
+            boxminus(x_next, x[k + 1], defect)
+            column[:, 0] = delta
+            _propagate_rows(column, column_out, dt, decay, f_vel, f_att, columns)
+            for i in range(n):
+                delta[i] = column_out[i, 0] + defect[i]
+        _propagate_rows(cov, work, dt, decay, f_vel, f_att, columns)
+        for i in range(n):
+            for j in range(n):
+                work_t[j, i] = work[i, j]
+        _propagate_rows(work_t, cov, dt, decay, f_vel, f_att, columns)
+        _interval_noise(noise[k, 3:6], middle, dt, spread)
+        for i in range(3):
+            cov[ATT + i, ATT + i] += noise[k, i] * dt
+            for j in range(3):
+                cov[VEL + i, VEL + j] += spread[i, j]
+                cov[POS + i, VEL + j] += 0.5 * dt * spread[i, j]
+                cov[VEL + i, POS + j] += 0.5 * dt * spread[i, j]
+                cov[POS + i, POS + j] += 0.25 * dt * dt * spread[i, j]
+        for i in range(9, n):
+            cov[i, i] += _slow_noise(walks[i], rates[i], dt, decay[i])
+        # The two products round differently on either side of the diagonal.
+        for i in range(n):
+            for j in range(i):
+                mean = 0.5 * (cov[i, j] + cov[j, i])
+                cov[i, j] = mean
+                cov[j, i] = mean
+    return cost
+
+
+@njit(cache=True)
+def _update(delta, cov, entries, used, count, residual, gain):
+    """Scalar update with unit noise; ``gain`` (n,) becomes P h / sqrt(S).
+
+    Returns the normalised innovation and sqrt(S).
+    """
+    n = len(delta)
+    innovation = residual
+    for j in range(n):
+        gain[j] = 0.0
+    for e in range(count):
+        c, v = used[e], entries[e]
+        innovation -= v * delta[c]
+        for j in range(n):
+            gain[j] += v * cov[c, j]
+    spread = 1.0
+    for e in range(count):
+        spread += entries[e] * gain[used[e]]
+    root = math.sqrt(spread)
+    normal = innovation / root
+    for j in range(n):
+        gain[j] /= root
+    for i in range(n):
+        delta[i] += gain[i] * normal
+        g = gain[i]
+        for j in range(n):
+            cov[i, j] -= g * gain[j]
+    return normal, root
+
+
+@njit(cache=True)
+def _store_row(at, entries, used, count, gain, value, root, r_entries, r_index, r_count, r_gain,
+               r_value):
+    for e in range(count):
+        r_entries[at, e] = entries[e] / root
+        r_index[at, e] = used[e]
+    r_count[at] = count
+    r_gain[at] = gain
+    r_value[at] = value
+
+
+@njit(cache=True)
+def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_cov, step,
+                   cov_out, var_out):
+    """Backward pass over first <= k < last; the adjoints are those at ``last`` before its rows
+    on entry, at ``first`` before its rows on return.
+
+    Args:
+        motion, storage: as in :func:`filter_segment`.
+        step: (last - first, n) smoothed deviations, result.
+        cov_out: (N, 3, 3, 3) covariances of position, velocity, attitude, result.
+        var_out: (N, n - 9) variances of the other states, result; every THINNING-th sample.
+
+    Returns:
+        Sum of the squared normalised process noise.
+    """
+    stamps, inputs, noise, gravity, rates, walks, layout, columns, _, _ = motion
+    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
+    n = len(adjoint)
+    f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
+    x_next, rate, force = np.empty(n + 1), np.empty(3), np.empty(3)
+    spread, decay = np.empty((3, 3)), np.ones(n)
+    column, column_out = np.empty((n, 1)), np.empty((n, 1))
+    work, work_t = np.empty((n, n)), np.empty((n, n))
+    u, quadratic = np.empty(n), 0.0
+    cost = 0.0
+    for k in range(last - 1, first - 1, -1):
+        if k < len(x) - 1:
+            dt = stamps[k]
+            for i in range(9, n):
+                decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
+            _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, decay,
+                                 layout, f_vel, f_att, x_next, rate, force)
+            _interval_noise(noise[k, 3:6], middle, dt, spread)
+            for i in range(3):
+                cost += noise[k, i] * dt * adjoint[ATT + i] ** 2
+                for j in range(3):
+                    cost += (spread[i, j] * (adjoint[VEL + i] + 0.5 * dt * adjoint[POS + i])
+                             * (adjoint[VEL + j] + 0.5 * dt * adjoint[POS + j]))
+            for i in range(9, n):
+                cost += (_slow_noise(walks[i], rates[i], dt, decay[i])
+                         * adjoint[i] ** 2)
+            column[:, 0] = adjoint
+            _adjoint_rows(column, column_out, dt, decay, f_vel, f_att, columns)
+            adjoint[:] = column_out[:, 0]
+            if with_cov:
+                _adjoint_rows(adjoint_cov, work, dt, decay, f_vel, f_att, columns)
+                for i in range(n):
+                    for j in range(n):
+                        work_t[j, i] = work[i, j]
+                _adjoint_rows(work_t, adjoint_cov, dt, decay, f_vel, f_att, columns)
+        cov, delta = s_cov[k - first], s_delta[k - first]
+        for i in range(n):
+            step[k - first, i] = delta[i]
+        for j in range(n):
+            a = adjoint[j]
+            for i in range(n):
+                step[k - first, i] += cov[j, i] * a
+        if with_cov:
+            slow = k % THINNING == 0 or k == len(x) - 1
+            _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out)
+        for r in range(r_start[k - first + 1] - 1, r_start[k - first] - 1, -1):
+            gain = r_gain[r]
+            value = r_value[r]
+            for i in range(n):
+                value -= gain[i] * adjoint[i]
+            if with_cov:
+                for i in range(n):
+                    u[i] = 0.0
+                for j in range(n):
+                    g = gain[j]
+                    for i in range(n):
+                        u[i] += g * adjoint_cov[j, i]
+                quadratic = 1.0
+                for i in range(n):
+                    quadratic += gain[i] * u[i]
+            for e in range(r_count[r]):
+                c, v = r_index[r, e], r_entries[r, e]
+                adjoint[c] += v * value
+                if with_cov:
+                    # h' u + u' h, then the corner that both contain.
+                    for i in range(n):
+                        adjoint_cov[c, i] -= v * u[i]
+                        adjoint_cov[i, c] -= v * u[i]
+            if with_cov:
+                for e in range(r_count[r]):
+                    for f in range(r_count[r]):
+                        adjoint_cov[r_index[r, e], r_index[r, f]] += (
+                            r_entries[r, e] * r_entries[r, f] * quadratic)
+    return cost
+
+
+@njit(cache=True)
+def _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out):
+    """Blocks of P - P L P that are reported."""
+    n = len(cov)
+    for i in range(n if slow else 9):
+        for j in range(n):
+            work[i, j] = 0.0
+        for m in range(n):
+            v = cov[i, m]
+            if v != 0.0:
+                for j in range(n):
+                    work[i, j] += v * adjoint_cov[m, j]
+    for b in range(3):
+        for i in range(3):
+            for j in range(i + 1):
+                total = cov[3 * b + i, 3 * b + j]
+                for m in range(n):
+                    total -= work[3 * b + i, m] * cov[m, 3 * b + j]
+                cov_out[k, b, i, j] = total
+                cov_out[k, b, j, i] = total
+    if not slow:
+        return
+    for i in range(9, n):
+        total = cov[i, i]
+        for m in range(n):
+            total -= work[i, m] * cov[m, i]
+        var_out[k, i - 9] = total
+
+
+@njit(cache=True)
+def apply_step(x, step, largest):
+    """Move states x (m, n + 1) by deviations step (m, n), in place; ``largest`` (3,) grows to
+    the largest change of position (m), velocity (m/s) and attitude (rad)."""
+    for k in range(len(x)):
+        boxplus(x[k], step[k])
+        for b in range(3):
+            size = math.sqrt(step[k, 3 * b] ** 2 + step[k, 3 * b + 1] ** 2
+                             + step[k, 3 * b + 2] ** 2)
+            largest[b] = max(largest[b], size)
+
+
+@njit(cache=True)
+def follow(x, count, cov, motion, measured, rows, innovation):
+    """Extended Kalman filter over the first ``count`` samples from x[0]; writes x."""
+    n = len(cov)
+    return filter_segment(0, count, True, x, np.zeros(n), cov, motion, measured, rows,
+                          innovation, False, _storage(0, 0, n))
+
+
+@njit(cache=True)
+def _storage(n_samples, n_rows, n):
+    return (np.empty((n_rows, MAX_ENTRIES)), np.empty((n_rows, MAX_ENTRIES), np.int64),
+            np.empty(n_rows, np.int64), np.empty((n_rows, n)), np.empty(n_rows),
+            np.empty(n_samples + 1, np.int64), np.empty((n_samples, n)),
+            np.empty((n_samples, n, n)))
+
+
+@njit(cache=True)
+def solve_linear(x, delta, cov, motion, measured, rows, innovation, with_cov, cov_out, var_out):
+    """Solve the problem linearised about x (N, n + 1) and move x to its solution.
+
+    Args:
+        delta, cov: prior deviation (n,) and covariance (n, n) of the first sample.
+        Others as in :func:`filter_segment` and :func:`smooth_segment`.
+
+    Returns:
+        Loss of all rows before the step, squared normalised process noise after it, largest
+        changes (3,) of position, velocity and attitude.
+    """
+    total, n = len(x), len(delta)
+    count = (total + SEGMENT - 1) // SEGMENT
+    kept_delta, kept_cov = np.empty((count, n)), np.empty((count, n, n))
+    most, cost, process = 0, 0.0, 0.0
+    nothing = _storage(0, 0, n)
+    for s in range(count):
+        first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
+        kept_delta[s], kept_cov[s] = delta, cov
+        most = max(most, 3 * (measured[0][last] - measured[0][first])
+                   + rows[0][last] - rows[0][first])
+        cost += filter_segment(first, last, False, x, delta, cov, motion, measured, rows,
+                               innovation, False, nothing)
+    storage = _storage(SEGMENT, most, n)
+    step, largest = np.empty((SEGMENT, n)), np.zeros(3)
+    adjoint, adjoint_cov = np.zeros(n), np.zeros((n, n))
+    for s in range(count - 1, -1, -1):
+        first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
+        filter_segment(first, last, False, x, kept_delta[s], kept_cov[s], motion, measured,
+                       rows, innovation, True, storage)
+        process += smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage,
+                                  with_cov, step, cov_out, var_out)
+        apply_step(x[first:last], step, largest)
+    return cost, process, largest

@@ -1,0 +1,246 @@
+"""The smoother: trajectory, attitude and sensor errors from a whole recording."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.events import detect_jump, jump_result, refine_jump
+from imu_fusion.estimation.smoother import initial, iterated, model
+from imu_fusion.estimation.smoother.inputs import prepare_imu, prepare_measurements
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.geometry.gravity import normal_gravity
+from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
+from imu_fusion.surfaces.hill import Hill
+
+SAMPLE = np.dtype([
+    ("stamp", "i8"), ("position_world", "f8", 3), ("vel_world", "f8", 3),
+    ("quat_world_imu", "f8", 4), ("acc", "f8", 3), ("gyr", "f8", 3), ("gyr_bias", "f8", 3),
+    ("acc_bias", "f8", 3), ("cov_position", "f8", (3, 3)), ("cov_velocity", "f8", (3, 3)),
+    ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3)])
+
+_KINDS = {model.FIX: "fix", model.VELOCITY: "velocity", model.MAG: "mag"}
+
+
+@dataclass(frozen=True)
+class SmootherResult:
+    """What the smoother found.
+
+    ``samples``: structured array (:data:`SAMPLE`), one per usable Imu sample; ``acc`` and
+    ``gyr`` are corrected of the estimated errors, in the imu frame; ``cov_attitude`` is that
+    of the rotation vector in imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
+    optional states, in SI units. ``innovations``: name -> (stamp (m,), normalised
+    innovations (m, 3)), white with unit variance where the model is right.
+    ``cost``: of the trajectory before each step; ``iterations`` counts the steps.
+    """
+
+    samples: np.ndarray
+    frame: LocalFrame
+    states: dict
+    innovations: dict
+    cost: tuple
+    iterations: int
+    converged: bool
+    events: object = None
+    jump: object = None
+
+    def summary(self):
+        """One line."""
+        jump = f", jump length {self.jump.length:.1f} m" if self.jump else ""
+        state = "converged" if self.converged else "did not converge"
+        return (f"{len(self.samples)} samples, {self.iterations} iterations ({state}), "
+                f"cost {self.cost[-1]:.6g}{jump}")
+
+
+class Smoother:
+    """Smooths recordings; holds parameters only.
+
+    Args:
+        params: SmootherParams.
+        surface: Surface or None.
+    """
+
+    def __init__(self, params=SmootherParams(), surface=None):
+        self.params, self.surface = params, surface
+
+    def run(self, imu, mag=None, fix=None, velocity=None, events=None, initial_quat=None):
+        """Smooth one recording.
+
+        Args:
+            imu: ImuLog. mag: MagLog or None. fix: FixLog. velocity: VelocityLog or None.
+            events: JumpEvents, or None: detected when the surface needs them.
+            initial_quat: (4,) attitude of the first sample; found from the data when None.
+
+        Returns:
+            SmootherResult.
+
+        Raises:
+            SampleError: unusable samples.
+            EstimationError: no fix; events needed and not found; no convergence to finite
+                values.
+        """
+        params, surface = self.params, self.surface
+        if params.method == "extended_rts":
+            from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
+            return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events)
+        prepared = prepare_imu(imu, params)
+        frame = reference_frame(surface, fix)
+        constraints = surface.constraints() if surface is not None else ()
+        if events is None and any(c.phase != "always" for c in constraints):
+            events = detect_jump(prepared.log, velocity)
+        measurements = prepare_measurements(frame, mag, fix, velocity, params)
+        problem = self._problem(prepared, frame, measurements, constraints, fix)
+        self._initialise(problem, mag, initial_quat)
+
+        hill = surface if isinstance(surface, Hill) and events is not None else None
+
+        def refine(problem, events):
+            return refine_jump(hill, _positions(problem), imu, events)
+
+        events, steps, converged, cov, var = iterated.solve(
+            problem, events if hill is not None else None, refine)
+        if not np.isfinite(problem.x).all():
+            raise EstimationError("the smoother diverged: noise far below that of the data, or "
+                                  "measurements of another recording")
+        return self._result(problem, frame, imu, hill, events, steps, converged, cov, var)
+
+    def _problem(self, prepared, frame, measurements, constraints, fix):
+        p = self.params
+        has_mag = bool(np.any(measurements.kind == model.MAG))
+        wander = np.array(p.gnss_position_error_sd)
+        blocks = {"mag_bias": [p.mag_bias_sd * 1e6] * 3 if has_mag else 0,
+                  "mag_scale": [p.mag_scale_sd] * 3 if has_mag else 0,
+                  "gnss_position_error": wander if wander.any() else 0,
+                  "gnss_time_offset": [p.gnss_time_offset_sd], "acc_matrix": [p.acc_matrix_sd] * 9,
+                  "gyr_scale": [p.gyr_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
+                  "body_height": [p.body_height_sd]}
+        present = {name: sd for name, sd in blocks.items() if np.any(sd)}
+        layout, size = model.make_layout(present)
+        sd = np.concatenate([[p.position_sd] * 3, [p.speed_sd] * 3, [p.attitude_sd] * 3,
+                             [p.gyr_bias_sd] * 3, [p.acc_bias_sd] * 3,
+                             *(present[name] for name, _ in model.BLOCKS if name in present)])
+        decay, walk = np.zeros(size), np.zeros(size)
+        walk[model.GYR_BIAS:model.GYR_BIAS + 3] = p.gyr_bias_walk ** 2
+        walk[model.ACC_BIAS:model.ACC_BIAS + 3] = p.acc_bias_walk ** 2
+        i = layout[model.GNSS_ERROR]
+        if i >= 0:
+            decay[i:i + 3] = 1.0 / p.gnss_position_error_tau
+            walk[i:i + 3] = 2.0 * wander ** 2 * decay[i]
+            sd[i:i + 3] = np.maximum(wander, 1e-6)
+        gravity = p.gravity
+        if gravity is None:
+            gravity = float(normal_gravity(frame.latitude_deg, frame.height))
+        field = np.zeros(3)
+        if has_mag:
+            field = p.magnetic_field
+            if field is None:
+                field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg,
+                                             frame.height, decimal_year(fix.stamp[0]))
+        return iterated.Problem(
+            imu=prepared, params=p, measurements=measurements, gravity=gravity,
+            field_world=np.array(field) * 1e6, constraints=constraints, layout=layout,
+            prior_sd=sd, decay_rate=decay, walk=walk)
+
+    def _initialise(self, problem, mag, initial_quat):
+        p, size = self.params, problem.size
+        kind, value = problem.attached[1], problem.attached[3]
+        prior = np.zeros(size + 1)
+        if not np.any(kind == model.FIX):
+            raise EstimationError("no fix lies within the Imu recording: do the stamps belong "
+                                  "together?")
+        prior[0:3] = value[kind == model.FIX][0]
+        if np.any(kind == model.VELOCITY):
+            prior[3:6] = value[kind == model.VELOCITY][0]
+        log = problem.imu.log
+        # A fifth of a second: long enough against noise, short against motion.
+        beginning = int(np.searchsorted(log.stamp, log.stamp[0] + 200_000_000))
+        acc = log.acc[:beginning].mean(axis=0)
+        i = problem.layout[model.LEVER_ARM]
+        if i >= 0:
+            prior[i + 1:i + 4] = p.gnss_lever_arm
+        i = problem.layout[model.BODY_HEIGHT]
+        problem.prior, problem.x = prior, np.empty((len(log), size + 1))
+        if i >= 0:
+            prior[i + 1] = p.body_height
+        # Quarter turns insure against a disturbed or mounted-over magnetometer.
+        candidates = 4
+        if initial_quat is None:
+            reading = None
+            if np.any(kind == model.MAG):
+                early = mag.between(log.stamp[0], log.stamp[beginning] + 1)
+                finite = np.isfinite(early.mag).all(axis=1)
+                reading = early.mag[finite].mean(axis=0) if finite.any() else None
+            initial_quat = initial.attitude_from_vectors(acc, reading, problem.field_world)
+            candidates = 12 if reading is None else 4
+        problem.search_heading(initial.headings(initial_quat, candidates))
+
+    def _result(self, problem, frame, imu, hill, events, steps, converged, cov, var):
+        recorded = problem.imu.recorded
+        x, layout, log = problem.x[recorded], problem.layout, problem.imu.log
+        cov, sd = cov[recorded], np.sqrt(np.maximum(var[recorded], 0.0))
+        samples = np.empty(len(x), SAMPLE)
+        samples["stamp"] = log.stamp[recorded]
+        samples["position_world"], samples["vel_world"] = x[:, 0:3], x[:, 3:6]
+        samples["quat_world_imu"] = x[:, 6:10]
+        samples["gyr_bias"], samples["acc_bias"] = x[:, 10:13], x[:, 13:16]
+        for block, name in enumerate(("cov_position", "cov_velocity", "cov_attitude")):
+            samples[name] = cov[:, block]
+        samples["gyr_bias_sd"], samples["acc_bias_sd"] = sd[:, 0:3], sd[:, 3:6]
+        gyr, acc = log.gyr[recorded], log.acc[recorded]
+        samples["gyr"], samples["acc"] = gyr - x[:, 10:13], acc - x[:, 13:16]
+        if layout[model.GYR_SCALE] >= 0:
+            i = layout[model.GYR_SCALE] + 1
+            samples["gyr"] += x[:, i:i + 3] * gyr
+        if layout[model.ACC_MATRIX] >= 0:
+            i = layout[model.ACC_MATRIX] + 1
+            samples["acc"] += np.einsum("nij,nj->ni", x[:, i:i + 9].reshape(-1, 3, 3), acc)
+        _recover_rates(samples, problem, recorded)
+        states = {}
+        for block, (name, width) in enumerate(model.BLOCKS):
+            if layout[block] >= 0:
+                i = layout[block]
+                unit = 1e-6 if name == "mag_bias" else 1.0
+                states[name] = (unit * x[:, i + 1:i + 1 + width],
+                                unit * sd[:, i - 9:i - 9 + width])
+        stamps, kinds = problem.measurements.stamp[problem.order], problem.attached[1]
+        innovations = {name: (stamps[kinds == kind], problem.innovation[kinds == kind])
+                       for kind, name in _KINDS.items() if np.any(kinds == kind)}
+        jump = None
+        if hill is not None:
+            jump = jump_result(hill, samples, imu, events)
+        return SmootherResult(samples, frame, states, innovations, tuple(problem.cost), steps,
+                              converged, events, jump)
+
+
+def reference_frame(surface, fix):
+    """The surface's frame, or one at the first valid fix."""
+    if surface is not None:
+        return surface.origin
+    valid = np.flatnonzero(fix.status >= 0) if fix is not None else ()
+    if not len(valid):
+        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
+                              "alone is the job of the orientation estimator")
+    i = valid[0]
+    return LocalFrame(float(fix.latitude_deg[i]), float(fix.longitude_deg[i]),
+                      float(fix.height[i]))
+
+
+def _positions(problem):
+    samples = np.empty(len(problem.x), SAMPLE)
+    samples["stamp"] = problem.imu.log.stamp
+    samples["position_world"], samples["vel_world"] = problem.x[:, 0:3], problem.x[:, 3:6]
+    return samples
+
+
+def _recover_rates(samples, problem, recorded):
+    """Where the gyroscope was clipped, the rate is that of the smoothed attitude."""
+    clipped = np.flatnonzero(problem.imu.clipped_gyr)
+    clipped = clipped[(clipped > 0) & (clipped < len(problem.x) - 1)]
+    if not len(clipped):
+        return
+    attitude = Rotation.from_quat(problem.x[:, 6:10])
+    span = (problem.imu.log.stamp[clipped + 1] - problem.imu.log.stamp[clipped - 1]) * 1e-9
+    turn = (attitude[clipped - 1].inv() * attitude[clipped + 1]).as_rotvec()
+    samples["gyr"][np.cumsum(recorded)[clipped] - 1] = turn / span[:, None]

@@ -1,0 +1,57 @@
+"""Errors of a GNSS receiver: white noise, a wandering position, outliers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class GnssErrors(Parameters):
+    """Errors of positions and velocities, east, north, up. Defaults: Fang 2020, table 5."""
+
+    position_sd: tuple[float, ...] = param((3.0, 3.0, 5.0), doc="Position error, east, north, up",
+                                           unit="m", low=0, length=3)
+    position_tau: float = param(0.0, doc="Correlation time of the position error (first-order "
+                                "Gauss-Markov); 0: white", unit="s", low=0)
+    correlated_share: float = param(0.95, doc="Share of the position variance that is "
+                                    "correlated when position_tau is set", low=0, high=1)
+    velocity_sd: tuple[float, ...] = param((0.1, 0.1, 0.3), doc="Velocity error", unit="m/s",
+                                           low=0, length=3)
+    outlier_share: float = param(0.0, doc="Share of fixes and velocities that are outliers",
+                                 low=0, high=1)
+    outlier_factor: float = param(10.0, doc="Standard deviations of an outlier, in units of "
+                                  "the nominal ones", low=1)
+    time_offset: float = param(0.0, doc="The receiver's stamps are late by this", unit="s")
+
+
+def gauss_markov(times, sd, tau, rng):
+    """Samples (n, k) of first-order Gauss-Markov errors at times (n,) s: stationary standard
+    deviation sd (k,), correlation exp(-dt/tau)."""
+    sd = np.asarray(sd, dtype=float)
+    error = np.empty((len(times), len(sd)))
+    error[0] = sd * rng.standard_normal(len(sd))
+    for i, dt in enumerate(np.diff(times)):
+        keep = np.exp(-dt / tau)
+        error[i + 1] = (keep * error[i]
+                        + sd * np.sqrt(1.0 - keep * keep) * rng.standard_normal(len(sd)))
+    return error
+
+
+def gnss_errors(times, errors, rng):
+    """Position (n, 3) and velocity (n, 3) errors at times (n,) s."""
+    n = len(times)
+    sd = np.array(errors.position_sd)
+    if errors.position_tau > 0.0:
+        share = errors.correlated_share
+        position = (gauss_markov(times, sd * np.sqrt(share), errors.position_tau, rng)
+                    + np.sqrt(1.0 - share) * sd * rng.standard_normal((n, 3)))
+    else:
+        position = sd * rng.standard_normal((n, 3))
+    velocity = np.array(errors.velocity_sd) * rng.standard_normal((n, 3))
+    for error, nominal in ((position, sd), (velocity, np.array(errors.velocity_sd))):
+        bad = rng.random(n) < errors.outlier_share
+        error[bad] = (errors.outlier_factor * nominal
+                      * rng.standard_normal((int(bad.sum()), 3)))
+    return position, velocity

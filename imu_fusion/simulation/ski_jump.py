@@ -1,0 +1,224 @@
+"""A ski jump with exact truth: in-run, flight, landing and run-out on a given hill.
+
+On the ground the body follows the profile; its acceleration contains the profile's
+curvature, so the motion is consistent to the tolerance of the integrator (1e-10).
+The jumper pushes off above the table and sinks on landing: the sensor leaves the
+profile by a known height near take-off and touch-down.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.geometry.gravity import gravity_world, normal_gravity
+from imu_fusion.parameters import Parameters, param
+from imu_fusion.surfaces.hill import Hill
+
+
+@dataclass(frozen=True)
+class JumpParams(Parameters):
+    """How somebody jumps."""
+
+    start_x: float = param(-78.0, doc="Start, hill frame", unit="m", high=-10)
+    rest: float = param(2.0, doc="Rest at the start", unit="s", low=0.5)
+    friction: float = param(0.02, doc="Friction coefficient of the skis", low=0, high=0.2)
+    drag_in_run: float = param(0.0011, doc="Drag over mass in the in-run", unit="1/m", low=0)
+    drag: float = param(0.0038, doc="Drag over mass in flight", unit="1/m", low=0)
+    lift: float = param(0.0056, doc="Lift over mass in flight", unit="1/m", low=0)
+    push_speed: float = param(1.4, doc="Speed of the push-off, vertical", unit="m/s", low=0)
+    push_duration: float = param(0.15, doc="Duration of the push-off", unit="s", low=0.05)
+    sink_time: float = param(0.05, doc="Time constant of the knees on landing", unit="s",
+                             low=0.01)
+    braking: float = param(6.0, doc="Deceleration in the out-run", unit="m/s^2", low=1)
+    drift: float = param(0.6, doc="Amplitude of the sideways motion after take-off", unit="m",
+                         low=0)
+    duration: float = param(27.0, doc="Length of the recording", unit="s", low=10)
+    mount: tuple[float, ...] = param((0.3, -0.2, 0.5), doc="Rotation vector of the sensor on "
+                                     "the body", unit="rad", length=3)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Exact motion at ``time`` (n,) s; vectors (n, 3), quaternions (n, 4)."""
+
+    time: np.ndarray
+    position_world: np.ndarray
+    vel_world: np.ndarray
+    acc_world: np.ndarray
+    quat_world_imu: np.ndarray
+    omega_imu: np.ndarray
+
+
+class SkiJump:
+    """One jump on ``hill``; :meth:`at` evaluates it at any times.
+
+    Attributes: ``t_start``, ``t_takeoff``, ``t_touchdown`` (s), ``x_touchdown`` (m) and
+    ``length`` (m) of the jump.
+    """
+
+    def __init__(self, hill: Hill, params: JumpParams = JumpParams()):
+        self.hill, self.params = hill, params
+        self.gravity = normal_gravity(hill.origin.latitude_deg, hill.origin.height)
+        self.t_start = params.rest
+        options = dict(method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.02, dense_output=True)
+
+        def edge(t, y):
+            return y[0]
+        edge.terminal = True
+        run = solve_ivp(self._ground(hill.in_run, params.drag_in_run, None),
+                        (self.t_start, self.t_start + 60.0), [params.start_x, 0.0],
+                        events=edge, **options)
+        if run.status != 1:
+            raise EstimationError(f"simulated jumper starting at {params.start_x} m never "
+                                  "reaches the table: less friction or a higher start")
+        self._run, self.t_takeoff = run.sol, run.t[-1]
+
+        x, u = run.y[:, -1]
+        z, slope, _ = hill.in_run(x)
+        vx = u / np.hypot(1.0, slope)
+        rise, rise_speed, _ = self._push(self.t_takeoff)
+
+        def ground(t, y):
+            return y[1] - hill.landing(y[0])[0] if t > self.t_takeoff + 0.3 else -1.0
+        ground.terminal, ground.direction = True, 1
+        flight = solve_ivp(self._flight, (self.t_takeoff, self.t_takeoff + 20.0),
+                           [x, z - rise, vx, slope * vx - rise_speed], events=ground, **options)
+        if flight.status != 1:
+            raise EstimationError("simulated jumper does not come down: less lift")
+        self._air, self.t_touchdown = flight.sol, flight.t[-1]
+        x, z, vx, vz = flight.y[:, -1]
+        slope = hill.landing(x)[1]
+        self._sink_speed = vz - slope * vx
+        self.x_touchdown, self.length = x, hill.jump_length(x)
+        brake_x = brentq(lambda x: hill.landing(x)[1] - 0.1, x, x + 200.0)
+        end = max(params.duration, self.t_touchdown) + 1.0
+        self._out = solve_ivp(self._ground(hill.landing, params.drag, brake_x),
+                              (self.t_touchdown, end), [x, vx * np.hypot(1.0, slope)],
+                              **options).sol
+
+    def _ground(self, profile, drag, brake_x):
+        """Right side for (x, speed along the profile)."""
+        def derivative(t, y):
+            x, u = y
+            slope = profile(x)[1]
+            cosine = 1.0 / np.hypot(1.0, slope)
+            rate = (self.gravity * cosine * (slope - self.params.friction * np.tanh(u / 0.1))
+                    - drag * u * u)
+            if brake_x is not None:
+                rate -= (self.params.braking * np.tanh(u) * 0.5
+                         * (1.0 + np.tanh((x - brake_x) / 5.0)))
+            return np.array([u * cosine, rate])
+        return derivative
+
+    def _flight(self, t, y):
+        speed = np.hypot(y[2], y[3])
+        drag, lift = self.params.drag * speed, self.params.lift * speed
+        return np.array([y[2], y[3], -drag * y[2] + lift * y[3],
+                         self.gravity - drag * y[3] - lift * y[2]])
+
+    def _push(self, t):
+        """Height above the table while pushing off, and its derivatives."""
+        p = self.params
+        s = np.clip((t - self.t_takeoff) / p.push_duration + 1.0, 0.0, 1.0)
+        return (p.push_speed * p.push_duration * (s ** 3 - 0.5 * s ** 4),
+                p.push_speed * (3.0 * s ** 2 - 2.0 * s ** 3),
+                p.push_speed / p.push_duration * 6.0 * (s - s * s))
+
+    def _sink(self, t):
+        """Height above the landing profile after touch-down (negative), and its derivatives."""
+        tau = self.params.sink_time
+        s = (t - self.t_touchdown) / tau
+        decay = -self._sink_speed * np.exp(-s)
+        return (decay * tau * (s + s * s), decay * (1.0 + s - s * s),
+                decay / tau * (s * s - 3.0 * s))
+
+    def _on_profile(self, t, state, derivative, profile, height):
+        """x, z and derivatives on a profile, at a height above it."""
+        x, u = state
+        du = np.array([derivative(ti, yi)[1] for ti, yi in zip(t, state.T)])
+        z, slope, curvature = profile(x)
+        cosine = 1.0 / np.hypot(1.0, slope)
+        vx = u * cosine
+        turn = curvature * cosine ** 2 * vx
+        ax = du * cosine - u * slope * cosine * turn
+        h, dh, ddh = height
+        return (np.stack([x, z - h]), np.stack([vx, slope * vx - dh]),
+                np.stack([ax, curvature * vx ** 2 + slope * ax - ddh]))
+
+    def _section(self, t):
+        """Position, velocity, acceleration (2, n) in the hill's long section, x and z."""
+        hill, p = self.hill, self.params
+        pos, vel, acc = np.zeros((3, 2, len(t)))
+        masks = [t < self.t_start, (t >= self.t_start) & (t < self.t_takeoff),
+                 (t >= self.t_takeoff) & (t < self.t_touchdown), t >= self.t_touchdown]
+        pos[:, masks[0]] = np.array([[p.start_x], [float(hill.in_run(p.start_x)[0])]])
+        m = masks[1]
+        pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
+            t[m], self._run(t[m]), self._ground(hill.in_run, p.drag_in_run, None), hill.in_run,
+            self._push(t[m]))
+        m = masks[2]
+        y = self._air(t[m])
+        pos[:, m], vel[:, m] = y[:2], y[2:]
+        acc[:, m] = np.array([self._flight(0.0, yi)[2:] for yi in y.T]).reshape(-1, 2).T
+        m = masks[3]
+        brake_x = brentq(lambda x: hill.landing(x)[1] - 0.1, self.x_touchdown,
+                         self.x_touchdown + 200.0)
+        pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
+            t[m], self._out(t[m]), self._ground(hill.landing, p.drag, brake_x), hill.landing,
+            self._sink(t[m]))
+        return pos, vel, acc
+
+    def _angles(self, t):
+        """Yaw, pitch, roll of the arm beside the direction of the jump, and their rates."""
+        def step(at, width):
+            s = np.tanh((t - at) / width)
+            return 0.5 * (1.0 + s), 0.5 * (1.0 - s * s) / width
+
+        def swing(amplitude, rate, phase):
+            return (amplitude * np.sin(rate * t + phase),
+                    amplitude * rate * np.cos(rate * t + phase))
+
+        def total(*terms):
+            return sum(v for v, _ in terms), sum(r for _, r in terms)
+
+        def scaled(k, term):
+            return k * term[0], k * term[1]
+
+        crouch = step(self.t_start + 0.4, 0.3)
+        push = step(self.t_takeoff - 0.05, 0.12)
+        land = step(self.t_touchdown - 0.1, 0.15)
+        rise = step(self.t_touchdown + 2.5, 0.6)
+        pitch = total((1.1, 0.0 * t), scaled(0.2, crouch), scaled(-1.0, push), scaled(-0.9, land),
+                      scaled(1.2, rise), swing(0.05, 5.0, 0.3))
+        roll = total(swing(0.06, 3.1, 0.0), scaled(0.3, push), scaled(-0.4, land))
+        yaw = total(swing(0.05, 2.3, 1.0), scaled(0.15, push), scaled(0.5, rise))
+        return yaw, pitch, roll
+
+    def at(self, t):
+        """The :class:`Motion` at times t (n,) s since the beginning of the recording."""
+        t = np.atleast_1d(np.asarray(t, dtype=float))
+        pos, vel, acc = self._section(t)
+        w, air = 0.5, np.maximum(t - self.t_takeoff, 0.0)
+        side = self.params.drift * np.stack([1.0 - np.cos(w * air), w * np.sin(w * air),
+                                             w * w * np.cos(w * air) * (air > 0)])
+        to_world = [self.hill.to_world(np.stack([a[0], s, a[1]], axis=1))
+                    for a, s in zip((pos, vel, acc), side)]
+        (yaw, dyaw), (pitch, dpitch), (roll, droll) = self._angles(t)
+        heading = np.pi / 2 - np.radians(self.hill.azimuth_deg)
+        body = Rotation.from_euler("ZYX", np.stack([heading + yaw, pitch, roll], axis=1))
+        mount = Rotation.from_rotvec(self.params.mount)
+        # Rates of the intrinsic z-y-x angles in body axes.
+        omega_body = np.stack([
+            droll - dyaw * np.sin(pitch),
+            dpitch * np.cos(roll) + dyaw * np.cos(pitch) * np.sin(roll),
+            -dpitch * np.sin(roll) + dyaw * np.cos(pitch) * np.cos(roll)], axis=1)
+        return Motion(t, *to_world, (body * mount).as_quat(), mount.inv().apply(omega_body))
+
+    def specific_force(self, motion):
+        """Specific force (n, 3) in sensor axes, m/s^2."""
+        g = np.array([gravity_world(p, self.gravity) for p in motion.position_world])
+        return Rotation.from_quat(motion.quat_world_imu).inv().apply(motion.acc_world - g)

@@ -1,0 +1,149 @@
+"""Curves z(x) of a hill's long section: x horizontal forward, z down, metres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import quad
+from scipy.interpolate import PchipInterpolator
+
+from imu_fusion.errors import LayoutError
+
+
+@dataclass(frozen=True)
+class Line:
+    """Through (x0, z0) with a constant slope dz/dx."""
+
+    x0: float
+    z0: float
+    slope: float
+
+    def __call__(self, x):
+        return self.z0 + self.slope * (x - self.x0), np.full_like(x, self.slope), np.zeros_like(x)
+
+
+@dataclass(frozen=True)
+class Arc:
+    """Lower arc of a circle (concave upwards) that has the slope angle ``angle`` at (x0, z0)."""
+
+    x0: float
+    z0: float
+    angle: float
+    radius: float
+
+    def at_angle(self, angle):
+        """The point (x, z) where the slope angle is ``angle``."""
+        return (self.x0 + self.radius * (np.sin(self.angle) - np.sin(angle)),
+                self.z0 - self.radius * (np.cos(self.angle) - np.cos(angle)))
+
+    def __call__(self, x):
+        u = x - self.x0 - self.radius * np.sin(self.angle)
+        root = np.sqrt(self.radius ** 2 - u * u)
+        return (self.z0 - self.radius * np.cos(self.angle) + root, -u / root,
+                -self.radius ** 2 / root ** 3)
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """Ascending coefficients in x - x0."""
+
+    x0: float
+    coefficients: tuple
+
+    def __call__(self, x):
+        p = np.polynomial.Polynomial(self.coefficients)
+        return p(x - self.x0), p.deriv(1)(x - self.x0), p.deriv(2)(x - self.x0)
+
+
+@dataclass(frozen=True)
+class TiltedCubic:
+    """``eta = c xi^3``: xi from (x0, z0) down a slope ``angle``, eta perpendicular, upwards."""
+
+    x0: float
+    z0: float
+    angle: float
+    c: float
+
+    def __call__(self, x):
+        s, k = np.sin(self.angle), np.cos(self.angle)
+        # Cardano; x grows monotonically with xi, so there is one real root.
+        p = k / (3.0 * self.c * s)
+        q = (x - self.x0) / (2.0 * self.c * s)
+        root = np.sqrt(q * q + p ** 3)
+        xi = np.cbrt(root + q) - np.cbrt(root - q)
+        slope_xi = 3.0 * self.c * xi * xi
+        dx = k + slope_xi * s
+        return (self.z0 + xi * s - self.c * xi ** 3 * k, (s - slope_xi * k) / dx,
+                -6.0 * self.c * xi / dx ** 3)
+
+
+@dataclass(frozen=True)
+class TiltedParabola:
+    """``eta = c xi^2`` in axes turned by ``tilt`` (z up, counter-clockwise), placed so that
+    the point ``xi_start`` lies at (x0, z0)."""
+
+    x0: float
+    z0: float
+    tilt: float
+    c: float
+    xi_start: float
+
+    def offset(self, xi):
+        """Horizontal and upward coordinates of the point xi, from the vertex."""
+        s, k = np.sin(self.tilt), np.cos(self.tilt)
+        return xi * k - self.c * xi * xi * s, xi * s + self.c * xi * xi * k
+
+    def __call__(self, x):
+        s, k = np.sin(self.tilt), np.cos(self.tilt)
+        x_start, up_start = self.offset(self.xi_start)
+        along = x - self.x0 + x_start
+        xi = 2.0 * along / (k + np.sqrt(k * k - 4.0 * self.c * s * along))
+        dx = k - 2.0 * self.c * xi * s
+        up = self.offset(xi)[1]
+        return (self.z0 - (up - up_start), -(s + 2.0 * self.c * xi * k) / dx,
+                -2.0 * self.c / dx ** 3)
+
+
+class Profile:
+    """A curve in pieces: ``pieces[i]`` holds between ``knots[i - 1]`` and ``knots[i]``."""
+
+    def __init__(self, knots, pieces):
+        self.knots = np.asarray(knots, dtype=float)
+        self.pieces = tuple(pieces)
+        if len(self.pieces) != len(self.knots) + 1 or np.any(np.diff(self.knots) <= 0):
+            raise LayoutError(f"profile: joints must increase, are {self.knots.round(3).tolist()}")
+
+    def __call__(self, x):
+        """z, dz/dx and d2z/dx2 at x (any shape)."""
+        x = np.asarray(x, dtype=float)
+        piece = np.searchsorted(self.knots, x)
+        result = np.empty((3, *x.shape))
+        for i in np.unique(piece):
+            here = piece == i
+            result[:, here] = self.pieces[i](x[here])
+        return result
+
+    def arc_length(self, x0, x1):
+        """Signed length of the curve from x0 to x1, m."""
+        joints = self.knots[(self.knots > min(x0, x1)) & (self.knots < max(x0, x1))]
+        return quad(lambda x: float(np.hypot(1.0, self(x)[1])), x0, x1,
+                    points=joints if len(joints) else None, limit=200)[0]
+
+
+def table_profile(points, where):
+    """Profile through surveyed points (n, 2) of increasing x: monotone cubics (PCHIP), whose
+    slope is continuous and does not overshoot; straight beyond both ends.
+
+    Raises:
+        LayoutError: fewer than two points, x not increasing, values not finite.
+    """
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+        raise LayoutError(f"{where}: expected a list of at least two [x, z]")
+    if not np.isfinite(points).all() or np.any(np.diff(points[:, 0]) <= 0):
+        raise LayoutError(f"{where}: x must increase and all values be finite")
+    curve = PchipInterpolator(points[:, 0], points[:, 1])
+    slope, curvature = curve.derivative(1), curve.derivative(2)
+    (x0, z0), (x1, z1) = points[0], points[-1]
+    return Profile([x0, x1], [Line(x0, z0, float(slope(x0))),
+                              lambda x: (curve(x), slope(x), curvature(x)),
+                              Line(x1, z1, float(slope(x1)))])
