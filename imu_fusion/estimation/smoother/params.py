@@ -52,6 +52,9 @@ class SmootherParams(Parameters):
     gnss_position_error_tau: float = param(30.0, doc="Its correlation time", unit="s", low=0.1)
     gnss_time_offset_sd: float = param(0.0, doc="Delay of the GNSS stamps as a state", unit="s",
                                        low=0.0, high=2.0)
+    velocity_time_offset_sd: float = param(0.0, doc="Further delay of velocities alone as a state; "
+                                           "receivers that difference positions report late",
+                                           unit="s", low=0.0, high=2.0)
     gnss_lever_arm: tuple[float, ...] = param((0.0, 0.0, 0.0), doc="Antenna in the imu frame",
                                               unit="m", length=3)
     gnss_lever_arm_sd: float = param(0.0, doc="Its uncertainty, as states", unit="m", low=0.0)
