@@ -144,7 +144,11 @@ def solve(problem, events, refine):
             break
         if moving:
             problem.attach()
-        if largest.max() > params.tolerance:
+        # Where readings change their sample as a delay is found, the step may end in a tiny
+        # cycle that no cost tells apart.
+        still = len(problem.cost) > 1 and (
+            abs(problem.cost[-1] - problem.cost[-2]) <= params.cost_tolerance)
+        if largest.max() > params.tolerance and not still:
             continue
         if refined:
             converged = True

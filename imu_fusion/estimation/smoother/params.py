@@ -83,3 +83,5 @@ class SmootherParams(Parameters):
     max_iterations: int = param(25, doc="Most Gauss-Newton steps", low=1, high=200)
     tolerance: float = param(1e-3, doc="Converged when no position (m), velocity (m/s) and "
                              "attitude (rad) moves by more", low=1e-9)
+    cost_tolerance: float = param(0.05, doc="Converged as well when the cost (half a sum of squared "
+                                  "standard deviations) changes by less", low=0.0)
