@@ -22,7 +22,7 @@ from imu_fusion.errors import ParameterError
 
 
 def param(default, *, doc, unit="", low=None, high=None, choices=None, length=None,
-          read_only=True):
+          read_only=True, path=False):
     """Declare one parameter as a dataclass field.
 
     Args:
@@ -33,10 +33,11 @@ def param(default, *, doc, unit="", low=None, high=None, choices=None, length=No
         choices: permitted strings.
         length: required number of elements of a tuple, or a tuple of permitted ones.
         read_only: whether a running node refuses to change it.
+        path: whether it names a file; relative ones are relative to the parameter file.
     """
     return dataclasses.field(default=default, metadata=dict(
         doc=doc, unit=unit, low=low, high=high, choices=choices, length=length,
-        read_only=read_only))
+        read_only=read_only, path=path))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +57,7 @@ class ParameterInfo:
     choices: tuple | None
     length: int | tuple | None
     read_only: bool
+    path: bool
 
     def describe_bounds(self):
         """The permitted values in words, for messages and tables."""

@@ -107,6 +107,20 @@ def quat_from_matrix(m):
 
 
 @njit(cache=True)
+def quat_to_rpy(q):
+    """Roll, pitch, yaw of a unit quaternion: R = Rz(yaw) Ry(pitch) Rx(roll) (REP 103).
+
+    Returns (3,) rad, pitch within +-pi/2; at pitch = +-pi/2 only roll -+ yaw is defined.
+    """
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    rpy = np.empty(3)
+    rpy[0] = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    rpy[1] = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    rpy[2] = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return rpy
+
+
+@njit(cache=True)
 def quat_rotate(q, v):
     """v turned by the unit quaternion q. q: (4,), v: (3,). Returns (3,)."""
     x, y, z, w = q[0], q[1], q[2], q[3]

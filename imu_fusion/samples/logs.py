@@ -61,6 +61,12 @@ class Log:
                    if getattr(self, name) is not None}
         return dataclasses.replace(self, stamp=self.stamp[index], **changes)
 
+    def flat(self):
+        """All columns side by side: (n, k) float64, without the stamps."""
+        columns = [getattr(self, name).reshape(len(self), int(np.prod(shape)))
+                   for name, shape in self._columns() if getattr(self, name) is not None]
+        return np.concatenate([np.empty((len(self), 0)), *columns], axis=1)
+
     def between(self, start, stop):
         """The rows with ``start <= stamp < stop`` (int nanoseconds)."""
         return self[(self.stamp >= start) & (self.stamp < stop)]
@@ -122,3 +128,15 @@ class PoseLog(Log):
     quat_world_imu: np.ndarray = _column((4,))
     position_world: np.ndarray = _column((3,))
     frame_id: str = "world"
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeLog(Log):
+    """Estimates as published on imu/data: ``quat_world_imu`` (n, 4), ``cov_attitude``
+    (n, 3, 3) rad^2 of the local error, ``gyr`` (n, 3) rad/s and ``acc`` (n, 3) m/s^2."""
+
+    quat_world_imu: np.ndarray = _column((4,))
+    cov_attitude: np.ndarray = _column((3, 3))
+    gyr: np.ndarray = _column((3,))
+    acc: np.ndarray = _column((3,))
+    frame_id: str = "imu_link"

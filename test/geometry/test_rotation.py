@@ -77,3 +77,11 @@ def test_right_jacobian_is_the_derivative_of_the_exponential():
             np.testing.assert_allclose(jacobian[:, i], forward / (2 * step), atol=1e-9)
         np.testing.assert_allclose(rot.right_jacobian_inverse(phi) @ jacobian, np.eye(3),
                                    atol=1e-12)
+
+
+def test_roll_pitch_yaw_are_those_of_rep_103():
+    for q in random_quats(seed=6):
+        yaw, pitch, roll = Rotation.from_quat(q).as_euler("ZYX")
+        np.testing.assert_allclose(rot.quat_to_rpy(q), [roll, pitch, yaw], atol=1e-12)
+    nose_down = np.array([0.0, np.sin(0.25), 0.0, np.cos(0.25)])
+    np.testing.assert_allclose(rot.quat_to_rpy(nose_down), [0.0, 0.5, 0.0], atol=ROUNDING)

@@ -19,7 +19,7 @@ from imu_fusion.surfaces.hill import Hill
 from imu_fusion.surfaces.plane import Plane
 from imu_fusion.surfaces.profile import table_profile
 
-_FOLDERS = (Path(__file__).parents[2] / "config" / "surfaces",
+_FOLDERS = (Path(__file__).parents[1] / "config" / "surfaces",
             Path(sys.prefix) / "share" / "imu_fusion" / "config" / "surfaces")
 
 

@@ -1,0 +1,315 @@
+"""Make the recordings of this folder from their sources, and the table in README.md.
+
+    python bags/make_bags.py [--source DIR] [--out DIR] [NAME ...]
+
+DIR holds ``broad/``, ``px4_plane/`` and ``drive_0708/`` as README.md describes them;
+``broad/`` may also hold the public ``data_mat/*.mat`` files of dlaidig/broad. Running it
+twice gives the same messages; the bytes of the files also depend on the version of zstd.
+"""
+
+import argparse
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import ImuFusionError
+from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.messages.convert import (
+    fix_message, imu_message, mag_message, pose_message, velocity_message)
+
+HERE = Path(__file__).resolve().parent
+IMU_FRAME = "imu_link"
+GNSS_FRAME = "gnss"
+WORLD_FRAME = "world"
+
+# BROAD gives a sampling rate and no stamps; its recordings start at this arbitrary instant.
+BROAD_EPOCH = 1_600_000_000_000_000_000
+
+IMU_TYPE = "sensor_msgs/msg/Imu"
+MAG_TYPE = "sensor_msgs/msg/MagneticField"
+FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+VELOCITY_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+POSE_TYPE = "geometry_msgs/msg/PoseStamped"
+BOOL_TYPE = "std_msgs/msg/Bool"
+
+# sensor_msgs/NavSatStatus
+STATUS_FIX, STATUS_GBAS_FIX = 0, 2
+
+FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+ENU_NED = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What is known of one recording; ``make(source)`` yields its topics."""
+
+    name: str
+    title: str
+    origin: str
+    licence: str
+    licence_file: str
+    attribution: str
+    sources: tuple
+    make: object
+
+
+def bool_message(value):
+    """CDR bytes of a std_msgs/Bool."""
+    return b"\x00\x01\x00\x00" + bytes([bool(value)])
+
+
+def read_broad(path):
+    """Samples of one BROAD trial as a mapping, from the npz given here or the public mat file."""
+    if path.exists():
+        return dict(np.load(path))
+    mat = scipy.io.loadmat(path.with_suffix(".mat"), squeeze_me=True)
+    names = {"gyr": "imu_gyr", "acc": "imu_acc", "mag": "imu_mag", "quat": "opt_quat",
+             "fs": "sampling_rate", "mov": "movement"}
+    return {short: np.asarray(mat[name]) for short, name in names.items()}
+
+
+def broad(trial):
+    """Topics of a BROAD trial.
+
+    Source: gyr rad/s, acc m/s^2, mag uT, quaternion w, x, y, z from the sensor to east-north-up.
+    Tesla are stored with the 24 bits of mantissa that the source has.
+    """
+    def make(source):
+        data = read_broad(source / "broad" / f"{trial}.npz")
+        n = len(data["gyr"])
+        stamp = BROAD_EPOCH + np.round(np.arange(n) * (1e9 / float(data["fs"]))).astype(np.int64)
+        mag = (data["mag"].astype(np.float64) * 1e-6).astype(np.float32).astype(np.float64)
+        quat = np.roll(data["quat"].astype(np.float64), -1, axis=1)
+        seen = np.isfinite(quat).all(axis=1)
+        moving = data["mov"].astype(bool)
+        change = np.flatnonzero(np.r_[True, moving[1:] != moving[:-1]])
+        yield "imu/data_raw", IMU_TYPE, [
+            (t, imu_message(t, IMU_FRAME, gyr, acc))
+            for t, gyr, acc in zip(stamp, data["gyr"].astype(float), data["acc"].astype(float))]
+        yield "imu/mag", MAG_TYPE, [(t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
+        yield "reference/pose", POSE_TYPE, [
+            (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp[seen], quat[seen])]
+        yield "reference/moving", BOOL_TYPE, [
+            (t, bool_message(m)) for t, m in zip(stamp[change], moving[change])]
+    return make
+
+
+def read_csv(path):
+    """(stamp (n,) int64, mapping of column name to (n,) float64) of a CSV with a header line."""
+    with open(path) as stream:
+        names = stream.readline().strip().split(",")
+    # Stamps exceed the 53 bits of a float.
+    stamp = np.loadtxt(path, delimiter=",", skiprows=1, usecols=0, dtype=np.int64)
+    values = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(1, len(names)))
+    return stamp, dict(zip(names[1:], values.T))
+
+
+def columns(table, *names):
+    return np.column_stack([table[name] for name in names])
+
+
+def imu_rows(stamp, table):
+    gyr = columns(table, "gyr_x", "gyr_y", "gyr_z")
+    acc = columns(table, "acc_x", "acc_y", "acc_z")
+    return [(t, imu_message(t, IMU_FRAME, g, a)) for t, g, a in zip(stamp, gyr, acc)]
+
+
+def velocity_rows(stamp, table):
+    velocity = columns(table, "vel_e", "vel_n", "vel_u")
+    return [(t, velocity_message(t, WORLD_FRAME, v)) for t, v in zip(stamp, velocity)]
+
+
+def px4_plane(source):
+    """Topics of the flight; the autopilot's own attitude is an estimate, not a reference."""
+    folder = source / "px4_plane"
+    stamp, imu = read_csv(folder / "imu.csv")
+    yield "imu/data_raw", IMU_TYPE, imu_rows(stamp, imu)
+    yield "imu/mag", MAG_TYPE, [(t, mag_message(t, IMU_FRAME, m)) for t, m in
+                                zip(stamp, columns(imu, "mag_x", "mag_y", "mag_z"))]
+    stamp, gnss = read_csv(folder / "gnss.csv")
+    yield "fix", FIX_TYPE, [
+        (t, fix_message(t, GNSS_FRAME, *position, status=STATUS_FIX))
+        for t, position in zip(stamp, columns(gnss, "lat_deg", "lon_deg", "height_m"))]
+    yield "fix_velocity", VELOCITY_TYPE, velocity_rows(stamp, gnss)
+    stamp, attitude = read_csv(folder / "onboard_attitude.csv")
+    quat = enu_flu_from_euler(columns(attitude, "yaw_deg", "pitch_deg", "roll_deg"))
+    yield "onboard_ekf/pose", POSE_TYPE, [
+        (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp, quat)]
+
+
+def enu_flu_from_euler(yaw_pitch_roll_deg):
+    """Quaternions (n, 4) xyzw from forward-left-up to east-north-up.
+
+    Args:
+        yaw_pitch_roll_deg: (n, 3) aerospace angles of a forward-right-down body in
+            north-east-down: yaw about down, then pitch about right, then roll about forward.
+    """
+    ned_frd = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True)
+    return (ENU_NED * ned_frd * FLU_FRD.inv()).as_quat()
+
+
+def drive(source):
+    """Topics of the drive: the RTK positions with their stated standard deviations."""
+    folder = source / "drive_0708"
+    stamp, imu = read_csv(folder / "imu.csv")
+    yield "imu/data_raw", IMU_TYPE, imu_rows(stamp, imu)
+    stamp, gnss = read_csv(folder / "gnss.csv")
+    position = columns(gnss, "lat_deg", "lon_deg", "height_m")
+    sd_enu = columns(gnss, "sd_e", "sd_n", "sd_u")
+    status = np.where(gnss["quality"] == 1, STATUS_GBAS_FIX, STATUS_FIX)
+    yield "fix", FIX_TYPE, [
+        (t, fix_message(t, GNSS_FRAME, *p, cov_enu=np.diag(sd ** 2), status=s))
+        for t, p, sd, s in zip(stamp, position, sd_enu, status)]
+    yield "fix_velocity", VELOCITY_TYPE, velocity_rows(stamp, gnss)
+
+
+def _broad(name, trial, title):
+    return Recording(
+        name, title, "[dlaidig/broad](https://github.com/dlaidig/broad), trial "
+        f"`{trial}`", "CC BY 4.0", "licenses/BROAD_CC-BY-4.0.txt",
+        "D. Laidig, M. Caruso, A. Cereatti, T. Seel: BROAD - A Benchmark for Robust Inertial "
+        "Orientation Estimation. Data 6(7):72, 2021, doi:10.3390/data6070072. Changed: units, "
+        "order of the quaternion, stamps from the sampling rate, format",
+        (f"broad/{trial}.npz",), broad(trial))
+
+
+RECORDINGS = {r.name: r for r in (
+    _broad("broad_06_fast_rotation", "06_undisturbed_fast_rotation_A",
+           "hand-turned sensor, fast rotations, undisturbed field"),
+    _broad("broad_15_fast_translation", "15_undisturbed_fast_translation_A",
+           "hand-moved sensor, fast translations, undisturbed field"),
+    _broad("broad_28_stationary_magnet", "28_disturbed_stationary_magnet_A",
+           "combined motion beside a magnet that stands still"),
+    Recording("px4_plane", "fixed-wing model aircraft: taxi, take-off and circuits",
+              "[priseborough/InertialNav](https://github.com/priseborough/InertialNav)",
+              "BSD-3-Clause", "licenses/InertialNav_BSD-3-Clause.txt",
+              "Copyright (c) 2014, Paul Riseborough",
+              ("px4_plane/imu.csv", "px4_plane/gnss.csv", "px4_plane/onboard_attitude.csv"),
+              px4_plane),
+    Recording("drive_0708", "car: hilly residential streets, then tight turns on a parking lot",
+              "[rtklibexplorer/GNSS_IMU](https://github.com/rtklibexplorer/GNSS_IMU), "
+              "`data/drive_0708`", "BSD-3-Clause", "licenses/GNSS_IMU_BSD-3-Clause.txt",
+              "Copyright (c) 2025, rtklibexplorer",
+              ("drive_0708/imu.csv", "drive_0708/gnss.csv"), drive),
+)}
+
+
+def write_recording(recording, source, out):
+    """Write one recording below ``out``, messages in order of stamp; returns its directory."""
+    rows = [(stamp, order, topic, msgtype, cdr)
+            for order, (topic, msgtype, messages) in enumerate(recording.make(source))
+            for stamp, cdr in messages]
+    rows.sort(key=lambda row: row[:2])
+    directory = out / recording.name
+    with BagWriter(directory, overwrite=True, chunk_size=1024 * 1024) as writer:
+        for stamp, _, topic, msgtype, cdr in rows:
+            writer.write("/" + topic, msgtype, cdr, int(stamp))
+    return directory
+
+
+def file_hash(path):
+    """SHA-256 of a file, hexadecimal."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def content_hash(directory):
+    """SHA-256 over topic, type, log time and bytes of all messages: independent of zstd."""
+    digest = hashlib.sha256()
+    with open_bag(directory) as reader:
+        for topic, msgtype, log_time, cdr in reader.messages():
+            digest.update(f"{topic}\n{msgtype}\n{log_time}\n{len(cdr)}\n".encode())
+            digest.update(cdr)
+    return digest.hexdigest()
+
+
+def describe(recording, directory, source):
+    """What the table and the tests need to know of a recording that was just written."""
+    (path,) = directory.glob("*.mcap")
+    with open_bag(directory) as reader:
+        topics = {name: {"type": info.msgtype, "count": info.count}
+                  for name, info in sorted(reader.topics.items())}
+        duration = (reader.end_time - reader.start_time) * 1e-9
+    sources = {}
+    for name in sorted(recording.sources):
+        path_of_source = source / name
+        if path_of_source.exists():  # the npz or CSV files, not what replaces them
+            sources[name] = file_hash(path_of_source)
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": file_hash(path),
+            "content_sha256": content_hash(directory), "duration_s": round(duration, 3),
+            "topics": topics, "sources": sources}
+
+
+BEGIN, END = "<!-- made by make_bags.py: begin -->", "<!-- made by make_bags.py: end -->"
+
+
+def tables(manifest):
+    """The generated part of README.md, from the descriptions of all recordings."""
+    lines = []
+    for name, recording in RECORDINGS.items():
+        entry = manifest.get(name)
+        if entry is None:
+            continue
+        lines += [
+            f"### {name}", "", f"{recording.title[0].upper()}{recording.title[1:]}.", "",
+            f"- origin: {recording.origin}",
+            f"- licence: {recording.licence}, [{recording.licence_file}]({recording.licence_file})",
+            f"- attribution: {recording.attribution}",
+            f"- file: `{name}/{entry['file']}`, {entry['bytes'] / 1e6:.2f} MB, "
+            f"{entry['duration_s']:.1f} s",
+            f"- sha256 of the file: `{entry['sha256']}`",
+            f"- sha256 of the messages: `{entry['content_sha256']}`",
+            *(f"- made from `{path}`, sha256 `{digest}`"
+              for path, digest in entry["sources"].items()),
+            "", "| topic | type | messages | mean rate |", "|---|---|---|---|"]
+        for topic, info in entry["topics"].items():
+            rate = f"{(info['count'] - 1) / entry['duration_s']:.2f} Hz"
+            if info["type"] == BOOL_TYPE:
+                rate = "at changes"
+            lines.append(f"| `{topic}` | {info['type'].replace('/msg/', '/')} | {info['count']} "
+                         f"| {rate} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def update_readme(readme, manifest):
+    """Replace the generated part of ``readme``."""
+    text = readme.read_text()
+    head, _, rest = text.partition(BEGIN)
+    _, _, tail = rest.partition(END)
+    readme.write_text(f"{head}{BEGIN}\n\n{tables(manifest)}\n{END}{tail}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME",
+                        help=f"recordings to make, default all: {', '.join(RECORDINGS)}")
+    parser.add_argument("--source", type=Path, default=HERE.parent.parent / "shared" / "data",
+                        help="folder of the sources (default %(default)s)")
+    parser.add_argument("--out", type=Path, default=HERE,
+                        help="where to write; README.md and manifest.json there are updated")
+    arguments = parser.parse_args()
+    unknown = sorted(set(arguments.names) - set(RECORDINGS))
+    if unknown:
+        parser.error(f"unknown recording {', '.join(unknown)}; known: {', '.join(RECORDINGS)}")
+    manifest_path = arguments.out / "manifest.json"
+    manifest = json.loads(manifest_path.read_text()) if manifest_path.exists() else {}
+    for name in arguments.names or RECORDINGS:
+        try:
+            directory = write_recording(RECORDINGS[name], arguments.source, arguments.out)
+            manifest[name] = describe(RECORDINGS[name], directory, arguments.source)
+        except (OSError, ImuFusionError) as error:
+            parser.exit(1, f"{name}: {error}\n")
+        print(f"{name}: {manifest[name]['bytes'] / 1e6:.2f} MB, "
+              f"{sum(t['count'] for t in manifest[name]['topics'].values())} messages")
+    manifest_path.write_text(json.dumps(manifest, indent=1, sort_keys=True) + "\n")
+    if (arguments.out / "README.md").exists():
+        update_readme(arguments.out / "README.md", manifest)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""Where the real recordings are: IMU_FUSION_DATA, or ../shared/data beside the repository."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from imu_fusion.samples.logs import ImuLog, MagLog
+
+
+def data_path(name):
+    """Path of a recording, file or folder; may not exist."""
+    root = os.environ.get("IMU_FUSION_DATA")
+    base = Path(root) if root else Path(__file__).resolve().parents[2] / "shared" / "data"
+    return base / name
+
+
+def broad_trials():
+    """Files of the BROAD trials at hand, sorted; empty where there are none."""
+    return sorted(data_path("broad").glob("*.npz"))
+
+
+def load_broad(path):
+    """One BROAD trial (Laidig et al. 2021, CC BY 4.0).
+
+    Returns:
+        ImuLog, MagLog, reference quat_world_imu (n, 4) xyzw (nan where unknown),
+        movement mask (n,).
+    """
+    d = np.load(path)
+    stamp = np.round(np.arange(len(d["gyr"])) * (1e9 / float(d["fs"]))).astype(np.int64)
+    quat = d["quat"].astype(float)[:, [1, 2, 3, 0]]
+    return (ImuLog(stamp, d["gyr"], d["acc"]), MagLog(stamp, d["mag"] * 1e-6), quat, d["mov"])
+
+
+def broad_errors(quat, reference, mask):
+    """BROAD's metric: RMSE in degrees of total, heading and inclination error.
+
+    quat, reference: (n, 4) xyzw. Heading 2 atan|z/w| and inclination
+    2 acos sqrt(w^2 + z^2) of the error quaternion in the world frame.
+    """
+    keep = mask & np.isfinite(reference).all(axis=1)
+    a, b = quat[keep], reference[keep] * [-1, -1, -1, 1]
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    z = a[:, 3] * b[:, 2] + a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] + a[:, 2] * b[:, 3]
+    w = a[:, 3] * b[:, 3] - a[:, 0] * b[:, 0] - a[:, 1] * b[:, 1] - a[:, 2] * b[:, 2]
+    heading = 2 * np.arctan2(np.abs(z), np.abs(w))
+    inclination = 2 * np.arccos(np.clip(np.hypot(w, z), 0, 1))
+    total = 2 * np.arccos(np.clip(np.abs(w), 0, 1))
+    return tuple(float(np.degrees(np.sqrt(np.mean(e ** 2))))
+                 for e in (total, heading, inclination))

@@ -1,0 +1,158 @@
+"""Offline: a recording in, estimates out, without DDS and as fast as the machine can.
+
+Runs the same guards, estimators and message encoders as the nodes. For the same
+recording and parameters the estimates are those of the nodes, bit for bit.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from imu_fusion.errors import TopicError
+from imu_fusion.estimation.orientation import OrientationParams
+from imu_fusion.messages import orientation_stream as orientation
+from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
+from imu_fusion.messages.convert import LOGS
+from imu_fusion.messages.layouts import IMU, MAG
+from imu_fusion.parameter_file import parameters_for
+from imu_fusion.samples.guard import guard_log
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One estimator of the batch path.
+
+    ``findings(logs)`` lists in words what looks wrong with whole logs as recorded.
+    ``run(params, logs)`` yields (topic, stamp, cdr) of the ``outputs``; ``logs`` maps a
+    topic to (log, epochs) of the samples fit for use, None for an optional topic
+    that the recording lacks.
+    """
+
+    node: str
+    params: type
+    required: dict
+    optional: dict
+    outputs: dict
+    run: Callable
+    findings: Callable
+
+
+@dataclass
+class StageReport:
+    """What one stage did: samples taken and refused per topic, messages written."""
+
+    node: str
+    params: object
+    used: dict = field(default_factory=dict)
+    refused: dict = field(default_factory=dict)
+    written: Counter = field(default_factory=Counter)
+    skipped: str = ""
+
+
+def stages():
+    """The estimators that ``process`` knows, by node name."""
+    return {stage.node: stage for stage in (
+        Stage("orientation_estimator", OrientationParams,
+              required={orientation.IMU_TOPIC: IMU.msgtype},
+              optional={orientation.MAG_TOPIC: MAG.msgtype},
+              outputs=orientation.OUTPUTS,
+              run=orientation.run,
+              findings=orientation.findings),
+    )}
+
+
+def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
+            progress=lambda text: None):
+    """Run every estimator whose topics are in a recording and write what it says.
+
+    Args:
+        bag: path of a recording.
+        out: rosbag2 directory to write.
+        params_file: ROS 2 parameter file, or None for defaults.
+        without: node names of estimators to leave out.
+        remap: dict of topic names of ours to those in the recording.
+        overwrite: replace ``out``.
+        progress: called with a line of text as things happen.
+
+    Returns:
+        (list of StageReport, list of what looks wrong with the recording)
+
+    Raises:
+        ImuFusionError: recording, parameters or topics are not usable.
+    """
+    remap = dict(remap or {})
+    known = stages()
+    for name in without:
+        if name not in known:
+            raise TopicError(f"no estimator '{name}'; there are: {', '.join(known)}")
+    with open_bag(bag) as reader:
+        chosen, reports = [], []
+        for stage in known.values():
+            report = StageReport(stage.node, parameters_for(stage.params, stage.node, params_file))
+            reports.append(report)
+            if stage.node in without:
+                report.skipped = "switched off"
+                continue
+            names = {}
+            for topic, msgtype in {**stage.required, **stage.optional}.items():
+                name = find_topic(reader.topics, remap.get(topic, topic))
+                if name is not None and reader.topics[name].count:
+                    names[topic] = reader.require(name, msgtype).name
+            missing = [topic for topic in stage.required if topic not in names]
+            if missing:
+                report.skipped = explain_missing(reader, {t: stage.required[t] for t in missing})
+            else:
+                chosen.append((stage, report, names))
+        if not chosen:
+            raise TopicError("nothing to do: " + "; ".join(
+                f"{r.node}: {r.skipped}" for r in reports))
+        wanted = sorted({name for _, _, names in chosen for name in names.values()})
+        progress(f"reading {', '.join(wanted)} from {Path(bag).name}")
+        logs = _read(reader, wanted)
+        warnings = list(reader.warnings)
+    with BagWriter(out, overwrite=overwrite) as writer:
+        for stage, report, names in chosen:
+            progress(f"{stage.node}: {', '.join(f'{len(logs[n][0])} {n}' for n in names.values())}")
+            inputs = {}
+            for topic, name in names.items():
+                _, log, epochs, guard = logs[name]
+                inputs[topic] = (log, epochs)
+                report.used[topic] = len(log)
+                if guard.refused():
+                    report.refused[topic] = guard.refused()
+            warnings += stage.findings({topic: logs[name][0] for topic, name in names.items()})
+            for topic, stamp, cdr in stage.run(report.params, inputs):
+                writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
+                report.written[topic] += 1
+    return reports, warnings
+
+
+def _read(reader, names):
+    """dict of topic to (log as recorded, log fit for use, its epochs, Guard), in bag order."""
+    raw = {name: [] for name in names}
+    for topic, _, _, cdr in reader.messages(names):
+        raw[topic].append(cdr)
+    logs = {name: LOGS[reader.topics[name].msgtype](messages) for name, messages in raw.items()}
+    return {name: (log, *guard_log(log)) for name, log in logs.items()}
+
+
+def explain_missing(reader, wanted):
+    """Words for topics that a recording lacks, with the ones in it that would fit.
+
+    Args:
+        reader: an open recording.
+        wanted: dict of topic to type.
+    """
+    parts = []
+    for topic, msgtype in wanted.items():
+        fitting = [t.name for t in reader.topics.values() if t.msgtype == msgtype and t.count]
+        text = f"no messages on '{topic}' ({msgtype})"
+        if fitting:
+            text += "; of that type it has " + ", ".join(fitting) \
+                + f": add --remap {topic}:={fitting[0]}"
+        else:
+            others = ", ".join(f"{t.name} ({t.msgtype})" for t in reader.topics.values())
+            text += f"; it has {others or 'no topics'}"
+        parts.append(text)
+    return "; ".join(parts)

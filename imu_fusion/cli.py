@@ -1,0 +1,237 @@
+"""The command line: ``imu_fusion --help``.
+
+Every command prints errors of the user in one line and ends with exit code 1;
+wrong usage ends with 2, an interrupted command with 130.
+"""
+
+import importlib
+import sys
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+import imu_fusion
+from imu_fusion.errors import ImuFusionError
+from imu_fusion.nodes import NODES
+
+PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True}
+console = Console(highlight=False)
+
+
+class _Group(click.Group):
+    """Turns the package's own errors into one line, without a traceback."""
+
+    def invoke(self, ctx):
+        try:
+            return super().invoke(ctx)
+        except ImuFusionError as error:
+            click.echo(f"imu_fusion: {error}", err=True)
+            ctx.exit(1)
+        except ModuleNotFoundError as error:
+            extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
+            if extra is None:
+                raise
+            click.echo(f"imu_fusion: this needs {error.name}: pip install 'imu_fusion[{extra}]'"
+                       + (", or source an installed ROS 2 Jazzy" if extra == "ros" else ""),
+                       err=True)
+            ctx.exit(1)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(imu_fusion.__version__)
+def cli():
+    """Orientation, acceleration fields and trajectories from inertial sensors."""
+
+
+def _remaps(values):
+    """dict of the NAME:=OTHER arguments."""
+    result = {}
+    for value in values:
+        name, sign, other = value.partition(":=")
+        if not (name and sign and other):
+            raise click.BadParameter(f"'{value}' is not of the form TOPIC:=OTHER",
+                                     param_hint="--remap")
+        result[name] = other
+    return result
+
+
+remap_option = click.option("--remap", multiple=True, metavar="TOPIC:=OTHER",
+                            help="Use topic OTHER of the recording for TOPIC. Repeatable.")
+overwrite_option = click.option("--overwrite", is_flag=True,
+                                help="Replace OUT if it is a recording.")
+
+
+@cli.command(context_settings=PASS_ON, add_help_option=False,
+             short_help="Start one node.")
+@click.argument("node", type=click.Choice(NODES))
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def run(node, arguments):
+    """Start NODE as `ros2 run imu_fusion NODE` would; ARGUMENTS go to it (--ros-args ...)."""
+    main_function = importlib.import_module(f"imu_fusion.nodes.{node}").main
+    sys.exit(main_function(list(arguments)))
+
+
+@cli.command()
+@click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
+@click.option("--without", multiple=True, metavar="NODE", help="Leave an estimator out. Repeatable.")
+@remap_option
+@overwrite_option
+def process(bag, out, params_file, without, remap, overwrite):
+    """Run the estimators on BAG without ROS and write the rosbag2 directory OUT.
+
+    An estimator runs if its topics are in the recording. The estimates are those
+    that the nodes publish, bit for bit.
+    """
+    from imu_fusion import batch
+    reports, warnings = batch.process(bag, out, params_file, without, _remaps(remap), overwrite,
+                                      progress=lambda text: click.echo(text, err=True))
+    for warning in warnings:
+        click.echo(f"warning: {warning}", err=True)
+    table = Table("estimator", "topic", "in", "refused", "out")
+    for report in reports:
+        if report.skipped:
+            click.echo(f"{report.node}: not run, {report.skipped}", err=True)
+        for topic, count in report.used.items():
+            refused = report.refused.get(topic, {})
+            table.add_row(report.node, topic, str(count),
+                          ", ".join(f"{n} {why}" for why, n in refused.items()) or "0", "")
+        for topic, count in report.written.items():
+            table.add_row(report.node, topic, "", "", str(count))
+    console.print(table)
+    click.echo(f"written: {out}")
+
+
+@cli.command()
+@click.argument("bag", type=click.Path())
+@click.option("--repair", "target", type=click.Path(), metavar="OUT",
+              help="Copy all that can be read into a clean recording OUT.")
+def info(bag, target):
+    """What is in BAG: topics, rates, gaps, and what looks wrong."""
+    from imu_fusion.messages.bag import open_bag, repair
+    from imu_fusion.messages.inspect import inspect_topics
+    with open_bag(bag) as reader:
+        duration = (reader.end_time - reader.start_time) * 1e-9
+        click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
+        for warning in reader.warnings:
+            click.echo(f"warning: {warning}")
+        rows = inspect_topics(reader)
+        click.echo(f"{'topic':<32} {'type':<44} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")
+        for row in rows:
+            click.echo(f"{row.topic:<32} {row.msgtype.replace('/msg/', '/'):<44} {row.count:>9} "
+                       f"{_number(row.rate, '{:.2f}'):>9} {_number(row.longest_gap, '{:.3f}'):>9}")
+        for row in rows:
+            for note in row.notes:
+                click.echo(f"  {row.topic}: {note}")
+    if target:
+        counts = repair(bag, target)
+        click.echo(f"written: {target} with {sum(counts.values())} messages")
+
+
+def _number(value, form):
+    return "" if value is None else form.format(value)
+
+
+@cli.command()
+@click.argument("source", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
+@remap_option
+@overwrite_option
+def convert(source, out, topics, remap, overwrite):
+    """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
+
+    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT.
+    """
+    from imu_fusion.messages.bag import BagWriter, open_bag
+    names = {other: name for name, other in _remaps(remap).items()}
+    with open_bag(source) as reader:
+        kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
+        renamed = {reader.require(other).name: name for other, name in names.items()}
+        with BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer:
+            with click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
+                                   length=sum(reader.topics[t].count for t in kept),
+                                   file=sys.stderr) as messages:
+                for topic, msgtype, log_time, cdr in messages:
+                    writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
+                                 qos=reader.topics[topic].qos_profiles or None)
+    click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
+
+
+@cli.command(context_settings=PASS_ON)
+@click.argument("bag", type=click.Path())
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+@click.option("--rate", type=float, default=1.0, show_default=True,
+              help="Speed; 0: as fast as our nodes take it, nothing lost.")
+@click.option("--loop", is_flag=True, help="Start over at the end.")
+@click.option("--clock", type=float, default=0.0, metavar="HZ", help="Publish /clock; 0: do not.")
+@click.option("--start-offset", type=float, default=0.0, help="Seconds to leave out at the start.")
+@click.option("--duration", type=float, help="Seconds to play.")
+@click.option("--topic", "topics", multiple=True, help="Play only this topic. Repeatable.")
+@click.option("--wait-for", "wait_for_nodes", multiple=True, metavar="NODE",
+              help="Wait for one of our nodes. Repeatable.")
+def play(bag, arguments, **options):
+    """Play BAG through the replayer node; further ARGUMENTS go to the node."""
+    from imu_fusion.nodes import replayer
+    sys.exit(replayer.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments]))
+
+
+@cli.command(context_settings=PASS_ON)
+@click.argument("out", type=click.Path())
+@click.argument("topics", nargs=-1)
+@click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd",
+              show_default=True)
+@overwrite_option
+def record(out, topics, **options):
+    """Record TOPICS (all, if none are given) into the rosbag2 MCAP directory OUT."""
+    from imu_fusion.nodes import recorder
+    sys.exit(recorder.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options)))
+
+
+def _ros_args(**values):
+    """--ros-args that set parameters; what is None or an empty list is left to its default."""
+    arguments = ["--ros-args"]
+    for name, value in values.items():
+        if value is None or value == ():
+            continue
+        if isinstance(value, tuple):
+            value = "[" + ", ".join(f"'{v}'" for v in value) + "]"
+        elif isinstance(value, bool):
+            value = str(value).lower()
+        elif isinstance(value, str):
+            value = f"'{value}'"
+        arguments += ["-p", f"{name}:={value}"]
+    return [*arguments, "--"]
+
+
+@cli.command()
+@click.argument("bag", type=click.Path())
+@click.option("--estimates", type=click.Path(), help="Recording with imu/data, if not in BAG.")
+@click.option("--out", type=click.Path(), default="report.html", show_default=True)
+def report(bag, estimates, out):
+    """Write an HTML report of BAG and its estimates, with a reference if BAG has one."""
+    from imu_fusion.report.recording import write_orientation_report
+    write_orientation_report(bag, estimates or bag, out)
+    click.echo(f"written: {out}")
+
+
+@cli.command()
+@click.argument("name", default="orientation")
+@click.option("--out", type=click.Path(), default="demo_out", show_default=True,
+              help="Directory for recording and report.")
+def demo(name, out):
+    """Play a real recording through the nodes, record, compare, report."""
+    from imu_fusion import demos
+    demos.run(name, out, console)
+
+
+def main():
+    """Entry point of the console script."""
+    cli(prog_name="imu_fusion")
+
+
+if __name__ == "__main__":
+    main()

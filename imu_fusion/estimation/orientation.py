@@ -1,0 +1,298 @@
+"""Orientation of an IMU: parameters and the estimator that nodes and batch share.
+
+:class:`OrientationEstimator` collects the first interval, finds the initial
+orientation from it and then hands every sample to a compiled kernel. A sample at a
+time or a whole log at once, the same kernel runs in the same order.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.errors import SampleError
+from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
+from imu_fusion.estimation import orientation_state as st
+from imu_fusion.estimation.orientation_alignment import align
+from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
+from imu_fusion.parameters import Parameters, param
+
+# Rotation from ENU to the world frame that is published, xyzw.
+_WORLD_FRAMES = {
+    "enu": (0.0, 0.0, 0.0, 1.0),
+    "nwu": (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5)),
+    "ned": (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+}
+_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class OrientationParams(Parameters):
+    """What the orientation estimator can be told."""
+
+    method: str = param("gyro_mag", choices=("gyro_mag",),
+                        doc="gyro_mag: Winkler 2025, gyroscope and magnetometer.")
+    world_frame: str = param("enu", choices=("enu", "ned", "nwu"),
+                             doc="World axes of the published orientation.")
+    declination_deg: float | None = param(
+        None, unit="deg", low=-180, high=180,
+        doc="Magnetic declination, positive east; unset: 0, north is magnetic north.")
+    yaw_offset_deg: float = param(0.0, unit="deg", low=-360, high=360,
+                                  doc="Turns the orientation about the vertical.")
+    alignment_duration: float = param(1.0, unit="s", low=0.05, high=60,
+                                      doc="First interval, from which the orientation starts.")
+    gyr_noise_density: float = param(1e-4, unit="rad/s/sqrt(Hz)", low=1e-9, high=1,
+                                     doc="Gyroscope noise.")
+    gyr_bias_sd: float = param(0.01, unit="rad/s", low=0, high=1,
+                               doc="Standard deviation of a bias that no rest has shown.")
+    gyr_bias_walk: float = param(1e-5, unit="rad/s/sqrt(s)", low=0, high=1,
+                                 doc="Random walk of the gyroscope bias.")
+    gyr_range: tuple[float, ...] | None = param(
+        None, unit="rad/s", low=1e-3, length=(1, 3),
+        doc="Largest rate the gyroscope reports, one value or one per axis; unset: none.")
+    acc_noise_density: float = param(2e-3, unit="m/s^2/sqrt(Hz)", low=1e-9, high=10,
+                                     doc="Accelerometer noise.")
+    acc_bias_sd: float = param(0.05, unit="m/s^2", low=0, high=10,
+                               doc="Standard deviation of the accelerometer bias.")
+    mag_noise_sd: float = param(1e-6, unit="T", low=1e-12, high=1e-4,
+                                doc="Noise of one magnetometer sample.")
+    mag_offset: tuple[float, ...] = param((0.0, 0.0, 0.0), unit="T", length=3,
+                                          doc="Hard iron, subtracted from every sample.")
+    mag_matrix: tuple[float, ...] = param(
+        (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), length=9,
+        doc="Soft iron, row by row; multiplies the sample after the offset.")
+    mag_reliability: float = param(5.0, low=0, doc="p of the weight (10) of Winkler 2025.")
+    field_sd: float = param(0.05, low=0, high=1,
+                            doc="Wander of the local field, relative to its norm.")
+    field_time: float = param(20.0, unit="s", low=1e-3, doc="Time constant of that wander.")
+    gyr_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
+                             doc="How late a rate is stamped.")
+    mag_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
+                             doc="How late a magnetometer sample is stamped.")
+    max_mag_lag: float = param(0.1, unit="s", low=0, high=10,
+                               doc="Magnetometer samples that arrive later are dropped.")
+    max_gap: float = param(0.1, unit="s", low=1e-3,
+                           doc="A longer step between Imu samples counts as a gap.")
+    gap_rate_sd: float = param(1.0, unit="rad/s", low=0,
+                               doc="Rate that may have gone unseen in a gap.")
+
+
+def _axes(value, default):
+    """A parameter of one or three elements as (3,)."""
+    return np.full(3, default) if value is None else np.broadcast_to(value, 3).astype(float)
+
+
+class OrientationEstimator:
+    """Causal orientation from gyroscope, accelerometer and magnetometer samples.
+
+    Rows of ORIENTATION_DTYPE come out, one per accepted Imu sample, in order. None
+    come while the first ``alignment_duration`` seconds are collected; then all of
+    them at once.
+
+    A sample that is not finite is counted and dropped, and so is an Imu sample
+    that is not newer than the last. A magnetometer sample may come late by up to
+    ``max_mag_lag``. After a gap the estimate goes on with a larger covariance.
+    """
+
+    def __init__(self, params=OrientationParams()):
+        self.params = params
+        self._kernel = gyro_mag
+        self._par = self._pack(params)
+        self._sample = np.empty(6)
+        self._mag = np.empty(3)
+        self._new_chunk()
+        self.reset()
+
+    def reset(self):
+        """Forget all samples: the next ones start a new alignment."""
+        self._x = np.zeros(self._kernel.X_SIZE)
+        self._k = np.zeros(self._kernel.K_SIZE, dtype=np.int64)
+        self._waiting = []
+        self._waiting_imus = 0
+        self._alignment = None
+
+    def add_imu(self, stamp, gyr, acc):
+        """Take one Imu sample.
+
+        Args:
+            stamp: int ns. gyr: (3,) rad/s. acc: (3,) specific force, m/s^2.
+
+        Returns:
+            ORIENTATION_DTYPE array of the rows that are now final, possibly none.
+        """
+        self._sample[:3] = gyr
+        self._sample[3:] = acc
+        if self._alignment is None:
+            return self._wait_imu(stamp)
+        return self._step(stamp)
+
+    def add_mag(self, stamp, mag):
+        """Take one magnetometer sample: int ns, (3,) tesla. Returns rows like add_imu."""
+        self._mag[:] = mag
+        if self._alignment is None:
+            if np.isfinite(self._mag).all():
+                self._waiting.append((stamp, self._mag.copy()))
+            else:
+                self._k[st.MAG_REJECTED] += 1
+        else:
+            self._kernel.push_mag(self._x, self._k, self._par, stamp, self._mag)
+        return self._chunk[:0]
+
+    def finish(self):
+        """The end of the stream: rows that still wait for the alignment."""
+        if self._alignment is None and self._waiting_imus:
+            return self._start()
+        return self._chunk[:0]
+
+    def run(self, imu, mag=None):
+        """Whole logs: the same as add_imu and add_mag in merge order, in one compiled loop.
+
+        Merge order is by stamp, the magnetometer first where stamps are equal.
+
+        Args:
+            imu: ImuLog. mag: MagLog or None.
+
+        Returns:
+            ORIENTATION_DTYPE array; call :meth:`finish` for what a log shorter than the
+            alignment leaves behind.
+        """
+        mag_stamps = np.empty(0, dtype=np.int64) if mag is None else mag.stamp
+        mags = np.empty((0, 3)) if mag is None else mag.mag
+        parts = []
+        i = j = 0
+        while self._alignment is None and i < len(imu):
+            while j < len(mag_stamps) and mag_stamps[j] <= imu.stamp[i]:
+                self.add_mag(int(mag_stamps[j]), mags[j])
+                j += 1
+            parts.append(self.add_imu(int(imu.stamp[i]), imu.gyr[i], imu.acc[i]))
+            i += 1
+        if self._alignment is None:
+            for later in range(j, len(mag_stamps)):
+                self.add_mag(int(mag_stamps[later]), mags[later])
+            return np.concatenate([self._chunk[:0], *parts])
+        return np.concatenate([*parts, self._run_kernel(
+            imu.stamp[i:], np.hstack([imu.gyr[i:], imu.acc[i:]]), mag_stamps[j:], mags[j:])])
+
+    def get_state(self):
+        """A snapshot for :meth:`set_state`: going on from it changes nothing."""
+        return dict(x=self._x.copy(), k=self._k.copy(), waiting=list(self._waiting),
+                    alignment=self._alignment)
+
+    def set_state(self, state):
+        """Go on from a snapshot of an estimator with the same parameters.
+
+        Raises:
+            SampleError: the snapshot is that of another method.
+        """
+        if state["x"].shape != self._x.shape or state["k"].shape != self._k.shape:
+            raise SampleError("the orientation snapshot was taken with another method; "
+                              f"this estimator runs '{self.params.method}'")
+        self._x = state["x"].copy()
+        self._k = state["k"].copy()
+        self._waiting = list(state["waiting"])
+        self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
+        self._alignment = state["alignment"]
+
+    def summary(self):
+        """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
+        k, x, a = self._k, self._x, self._alignment
+        counts = dict(
+            method=self.params.method, aligned=a is not None, imu_used=int(k[st.IMU_USED]),
+            imu_rejected=int(k[st.IMU_REJECTED]), mag_used=int(k[st.MAG_USED]),
+            mag_rejected=int(k[st.MAG_REJECTED]), mag_late=int(k[st.MAG_LATE]),
+            mag_disturbed=int(k[st.MAG_DISTURBED]), gaps=int(k[st.GAPS]),
+            saturated=int(k[st.SATURATED]))
+        if a is None:
+            return counts
+        bias = x[st.GYR_BIAS:st.GYR_BIAS + 3]
+        return counts | dict(
+            started_at_rest=a.at_rest, has_heading=bool(k[st.HEADING_KNOWN]),
+            **{f"initial_quat_{c}": float(v) for c, v in zip("xyzw", a.quat_world_imu)},
+            initial_tilt_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[0, 0])),
+            initial_heading_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[2, 2])),
+            inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
+            gravity=a.gravity,
+            **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", bias)},
+            gyr_delay=self.params.gyr_delay, mag_delay=self.params.mag_delay)
+
+    def _step(self, stamp):
+        if self._next == _CHUNK:
+            self._new_chunk()
+        i = self._next
+        if not self._kernel.step_imu(self._x, self._k, self._par, stamp, self._sample,
+                                     self._floats[i], self._ints[i]):
+            return self._chunk[:0]
+        self._next = i + 1
+        return self._chunk[i:i + 1]
+
+    def _new_chunk(self):
+        # Rows are handed out as slices of a chunk: one allocation for many samples.
+        self._chunk = np.zeros(_CHUNK, ORIENTATION_DTYPE)
+        self._floats, self._ints = _views(self._chunk)
+        self._next = 0
+
+    def _wait_imu(self, stamp):
+        last = next((s for s, v in reversed(self._waiting) if len(v) == 6), None)
+        if not np.isfinite(self._sample).all() or (last is not None and stamp <= last):
+            self._k[st.IMU_REJECTED] += 1
+            return self._chunk[:0]
+        self._waiting.append((stamp, self._sample.copy()))
+        self._waiting_imus += 1
+        first = next(s for s, v in self._waiting if len(v) == 6)
+        if stamp - first < self.params.alignment_duration * 1e9:
+            return self._chunk[:0]
+        return self._start()
+
+    def _start(self):
+        """Align on the waiting samples and send them through the kernel."""
+        p, par = self.params, self._par
+        imus = [(s, v) for s, v in self._waiting if len(v) == 6]
+        stamps = np.array([s for s, _ in imus], dtype=np.int64)
+        samples = np.array([v for _, v in imus])
+        mags = [(s, v) for s, v in self._waiting if len(v) == 3]
+        mag_stamps = np.array([s for s, _ in mags], dtype=np.int64)
+        mag = np.array([v for _, v in mags]).reshape(-1, 3)
+        calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
+                      @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
+        a = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
+                  declination=math.radians(p.declination_deg or 0.0),
+                  yaw_offset=math.radians(p.yaw_offset_deg), gyr_density=p.gyr_noise_density,
+                  gyr_bias_sd=p.gyr_bias_sd, acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
+        self._alignment = a
+        self._kernel.initialise(self._x, self._k, par, a)
+        self._k[st.ALIGN_UNTIL] = stamps[-1]
+        self._waiting, self._waiting_imus = [], 0
+        after = mag_stamps >= stamps[0]
+        return self._run_kernel(stamps, samples, mag_stamps[after], mag[after])
+
+    def _run_kernel(self, stamps, samples, mag_stamps, mags):
+        rows = np.zeros(len(stamps), ORIENTATION_DTYPE)
+        written = self._kernel.run_loop(self._x, self._k, self._par, stamps, samples,
+                                        mag_stamps, mags, *_views(rows))
+        return rows[:written]
+
+    def _pack(self, p):
+        par = np.zeros(self._kernel.P_SIZE)
+        par[st.P_GYR_DELAY] = p.gyr_delay
+        par[st.P_MAG_DELAY] = p.mag_delay
+        par[st.P_MAX_LAG] = p.max_mag_lag
+        par[st.P_MAX_GAP] = p.max_gap
+        par[st.P_GYR_DENSITY] = p.gyr_noise_density
+        par[st.P_ACC_DENSITY] = p.acc_noise_density
+        par[st.P_ACC_BIAS_SD] = p.acc_bias_sd
+        par[st.P_MAG_SD] = p.mag_noise_sd
+        par[st.P_RELIABILITY] = p.mag_reliability
+        par[st.P_GAP_RATE_SD] = p.gap_rate_sd
+        par[st.P_BIAS_WALK] = p.gyr_bias_walk
+        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.inf)
+        par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
+        par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset
+        par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9] = p.mag_matrix
+        self._kernel.pack(par, p)
+        return par
+
+
+def _views(rows):
+    """Float and integer (n, ROW_WORDS) views of contiguous rows."""
+    return (rows.view(np.float64).reshape(-1, st.ROW_WORDS),
+            rows.view(np.int64).reshape(-1, st.ROW_WORDS))

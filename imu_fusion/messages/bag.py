@@ -1,0 +1,472 @@
+"""Recordings: read rosbag2 (MCAP, sqlite3) and ROS 1 bags, write rosbag2 MCAP.
+
+Reading goes through ``rosbags``; a file without its closing index (power loss,
+``kill -9``) is read chunk by chunk with ``mcap``. Writing goes through ``mcap``,
+which stores CRCs and keeps log and publish time apart.
+"""
+
+import os
+import shutil
+import struct
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mcap.exceptions
+import mcap.records
+import mcap.writer
+import yaml
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
+
+from imu_fusion.errors import BagError, TopicError
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+
+_UNLIMITED = {"sec": 2147483647, "nsec": 4294967295}
+RELIABLE = "reliable"
+BEST_EFFORT = "best_effort"
+
+
+class _Dumper(yaml.SafeDumper):
+    """YAML without anchors: equal values are written out each time."""
+
+    def ignore_aliases(self, data):
+        return True
+
+
+def qos_profile(depth=10, reliability=RELIABLE, durability="volatile", history="keep_last"):
+    """The offered QoS of one topic as rosbag2 (metadata version 9) stores it."""
+    return {"history": history, "depth": int(depth), "reliability": reliability,
+            "durability": durability, "deadline": dict(_UNLIMITED), "lifespan": dict(_UNLIMITED),
+            "liveliness": "automatic", "liveliness_lease_duration": dict(_UNLIMITED),
+            "avoid_ros_namespace_conventions": False}
+
+
+@dataclass
+class TopicInfo:
+    """One topic of a recording; ``count`` is None while it is not known."""
+
+    name: str
+    msgtype: str
+    count: int | None
+    qos_profiles: list = field(default_factory=list)
+
+
+def open_bag(path):
+    """Open a recording for reading: a context manager with ``topics`` and ``messages``.
+
+    Args:
+        path: a rosbag2 directory, an ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
+
+    Raises:
+        BagError: nothing there, not a recording, or damaged beyond reading.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f"{path}: no such file or directory")
+    files, directory = _storage_files(path)
+    if all(f.stat().st_size == 0 for f in files):
+        raise BagError(f"{path}: the recording is empty (0 bytes); nothing was written to it")
+    try:
+        return _IndexedReader(path, directory or files[0])
+    except (AnyReaderError, OSError, KeyError, ValueError, struct.error) as error:
+        if files[0].suffix != ".mcap":
+            raise BagError(f"{path}: cannot be read ({error})") from None
+        reason = error
+    reader = _RecoveringReader(path, files, reason)
+    if not reader.topics:
+        raise BagError(f"{path}: damaged, and no complete chunk could be recovered ({reason})")
+    return reader
+
+
+def _storage_files(path):
+    """(the storage files, the rosbag2 directory if it has its metadata)."""
+    if path.is_file():
+        if path.suffix not in (".mcap", ".db3", ".bag"):
+            raise BagError(f"{path}: not a recording; expected a rosbag2 directory or a "
+                           ".mcap, .db3 or .bag file")
+        return [path], None
+    for suffix in (".mcap", ".db3"):
+        files = sorted(path.glob(f"*{suffix}"), key=_split_index)
+        if files:
+            return files, path if (path / "metadata.yaml").exists() else None
+    raise BagError(f"{path}: a directory without .mcap or .db3 files is not a recording")
+
+
+def _split_index(path):
+    """Order of the files of a split recording: by the number at their end, 2 before 10."""
+    number = path.stem.rpartition("_")[2]
+    return (int(number) if number.isdigit() else 0, path.name)
+
+
+class _Reader:
+    """What every reader offers; ``warnings`` says what is wrong with the recording."""
+
+    def __init__(self, path):
+        self.path = Path(path)
+        self.topics = {}
+        self.start_time = self.end_time = 0
+        self.warnings = []
+        self.typestore = TYPES
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        """Release the files."""
+
+    @property
+    def count(self):
+        """Number of messages."""
+        return sum(info.count for info in self.topics.values())
+
+    def require(self, name, msgtype=None):
+        """The TopicInfo of ``name`` (with or without leading slash), or a TopicError."""
+        key = find_topic(self.topics, name)
+        if key is None:
+            listing = ", ".join(f"{t.name} ({t.msgtype})" for t in self.topics.values()) or "none"
+            raise TopicError(f"{self.path}: no topic '{name}'; it has: {listing}")
+        info = self.topics[key]
+        if msgtype and info.msgtype != msgtype:
+            raise TopicError(f"{self.path}: topic '{name}' is {info.msgtype}, expected {msgtype}")
+        return info
+
+    def definition(self, msgtype):
+        """(ros2msg definition with its dependencies, RIHS01 hash) of a type in this recording."""
+        return self.typestore.generate_msgdef(msgtype, ros_version=2)[0], \
+            self.typestore.hash_rihs01(msgtype)
+
+
+def find_topic(names, wanted):
+    """The entry of ``names`` that is ``wanted`` up to a leading slash, or None."""
+    for candidate in (wanted, "/" + wanted.lstrip("/"), wanted.lstrip("/")):
+        if candidate in names:
+            return candidate
+    return None
+
+
+class _IndexedReader(_Reader):
+    """A complete recording, through rosbags."""
+
+    def __init__(self, path, source):
+        super().__init__(path)
+        self._reader = AnyReader([source], default_typestore=TYPES)
+        self._reader.open()
+        try:
+            self._is_ros1 = not self._reader.is2
+            if not self._is_ros1:
+                self.typestore = self._reader.typestore
+            for name, info in self._reader.topics.items():
+                if info.msgtype is None:
+                    kinds = sorted({c.msgtype for c in info.connections})
+                    self.warnings.append(f"topic {name} holds several types ({', '.join(kinds)}) "
+                                         "and is left out")
+                    continue
+                qos = [] if self._is_ros1 else _qos_of(info.connections[0])
+                self.topics[name] = TopicInfo(name, info.msgtype, info.msgcount, qos)
+            if any(info.count for info in self.topics.values()):
+                self.start_time = self._reader.start_time
+                self.end_time = self._reader.end_time
+        except BaseException:
+            self._reader.close()
+            raise
+
+    def close(self):
+        self._reader.close()
+
+    def messages(self, topics=None, start=None, stop=None):
+        """Yield (topic, msgtype, log time int nanoseconds, CDR bytes) in order of log time.
+
+        Args:
+            topics: names to yield; None for all.
+            start, stop: bounds of the log time, start inclusive, stop exclusive.
+        """
+        wanted = self.topics if topics is None else topics
+        connections = [c for c in self._reader.connections
+                       if c.topic in wanted and c.topic in self.topics]
+        if not connections:
+            return
+        try:
+            for connection, log_time, data in self._reader.messages(connections, start, stop):
+                if self._is_ros1:
+                    data = TYPES.ros1_to_cdr(data, connection.msgtype)
+                yield connection.topic, connection.msgtype, log_time, data
+        except KeyError as error:
+            raise BagError(f"{self.path}: type {error} is not known; only ROS 2 Jazzy's own types "
+                           "can be read from a ROS 1 bag") from None
+        except Exception as error:
+            if isinstance(error, (AnyReaderError, OSError, struct.error, ValueError,
+                                  AssertionError)) or "Error" in type(error).__name__:
+                raise BagError(f"{self.path}: damaged while reading ({error}); "
+                               "try imu_fusion info --repair") from error
+            raise
+
+
+def _qos_of(connection):
+    return [qos_profile(q.depth, q.reliability.name.lower(), q.durability.name.lower(),
+                        q.history.name.lower())
+            for q in getattr(connection.ext, "offered_qos_profiles", [])]
+
+
+class _RecoveringReader(_Reader):
+    """MCAP files without a usable index: every complete chunk, in the order of the file."""
+
+    def __init__(self, path, files, reason):
+        super().__init__(path)
+        self._files = files
+        self._schemas = {}
+        counts, times = Counter(), []
+        for topic, _, log_time, _ in self._scan():
+            counts[topic] += 1
+            times.append(log_time)
+        for name, info in self.topics.items():
+            info.count = counts[name]
+        if times:
+            self.start_time, self.end_time = min(times), max(times) + 1
+        self.warnings.append(f"not closed properly ({reason}); {len(times)} messages recovered "
+                             "from its complete chunks; imu_fusion info --repair writes a clean "
+                             "copy")
+
+    def _scan(self):
+        for path in self._files:
+            schemas, channels = {}, {}
+            with open(path, "rb") as stream:
+                try:
+                    for record in StreamReader(stream, validate_crcs=True).records:
+                        if isinstance(record, mcap.records.Schema):
+                            schemas[record.id] = record
+                        elif isinstance(record, mcap.records.Channel):
+                            channels[record.id] = self._register(record, schemas)
+                        elif isinstance(record, mcap.records.Message):
+                            topic = channels.get(record.channel_id)
+                            if topic is not None:
+                                yield topic, self.topics[topic].msgtype, record.log_time, record.data
+                except (mcap.exceptions.McapError, EOFError, struct.error, ValueError,
+                        RuntimeError) as error:
+                    # The open chunk at the end is lost; what came before has been yielded.
+                    self._broken = error
+                except Exception as error:  # decompressors raise types of their own
+                    if "zstd" not in repr(type(error)).lower() and "lz4" not in repr(error).lower():
+                        raise
+                    self._broken = error
+
+    def _register(self, channel, schemas):
+        schema = schemas.get(channel.schema_id)
+        if schema is None or channel.message_encoding != "cdr":
+            return None
+        if channel.topic not in self.topics:
+            msgtype = normalize_msgtype(schema.name)
+            self.topics[channel.topic] = TopicInfo(channel.topic, msgtype, None, yaml.safe_load(
+                channel.metadata.get("offered_qos_profiles", "")) or [])
+            if msgtype not in TYPES.fielddefs and schema.encoding == "ros2msg":
+                self._learn(msgtype, schema)
+        return channel.topic
+
+    def _learn(self, msgtype, schema):
+        if self.typestore is TYPES:
+            self.typestore = get_typestore(Stores.ROS2_JAZZY)
+        known = get_types_from_msg(schema.data.decode("utf-8", "replace"), msgtype)
+        self.typestore.register({k: v for k, v in known.items()
+                                 if k not in self.typestore.fielddefs})
+
+    def messages(self, topics=None, start=None, stop=None):
+        """As :meth:`_IndexedReader.messages`, in order of log time."""
+        rows = [(log_time, i, topic, msgtype, data)
+                for i, (topic, msgtype, log_time, data) in enumerate(self._scan())
+                if (topics is None or topic in topics)
+                and (start is None or log_time >= start) and (stop is None or log_time < stop)]
+        rows.sort(key=lambda row: row[:2])
+        for log_time, _, topic, msgtype, data in rows:
+            yield topic, msgtype, log_time, data
+
+
+class BagWriter:
+    """Write a rosbag2 directory: ``<directory>/<name>_0.mcap`` and ``metadata.yaml``.
+
+    A chunk is on its way to the disk as soon as it is complete, so that a crash
+    loses at most the open one.
+
+    Args:
+        directory: must not exist or be empty, unless ``overwrite``.
+        compression: ``zstd``, ``lz4`` or ``none``.
+        chunk_size: bytes of messages per chunk.
+        overwrite: replace what is there, if it is a recording.
+        typestore: source of message definitions; Jazzy's by default.
+
+    Raises:
+        BagError: the directory is in the way or cannot be written.
+    """
+
+    def __init__(self, directory, compression="zstd", chunk_size=256 * 1024, overwrite=False,
+                 typestore=TYPES):
+        self.directory = Path(directory)
+        self.counts = Counter()
+        self._typestore = typestore
+        self._channels = {}
+        self._topics = {}
+        self._first = self._last = None
+        self._sequence = Counter()
+        self._prepare(overwrite)
+        name = self.directory.resolve().name
+        self._file = f"{name}_0.mcap"
+        try:
+            self._stream = open(self.directory / self._file, "wb")
+        except OSError as error:
+            raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
+        self._position = 0
+        self._writer = mcap.writer.Writer(
+            self._stream, chunk_size=chunk_size,
+            compression=mcap.writer.CompressionType[compression.upper()])
+        self._writer.start(profile="ros2", library="imu_fusion")
+        self._flush()
+
+    def _prepare(self, overwrite):
+        try:
+            if self.directory.exists():
+                if not self.directory.is_dir():
+                    raise BagError(f"{self.directory}: is a file, not a directory to record into")
+                present = sorted(p.name for p in self.directory.iterdir())
+                ours = all(p == "metadata.yaml" or p.endswith((".mcap", ".db3")) for p in present)
+                if present and not (overwrite and ours):
+                    raise BagError(f"{self.directory}: exists and is not empty; choose another "
+                                   "directory" + ("" if ours else " (it holds other files)"))
+                shutil.rmtree(self.directory)
+            self.directory.mkdir(parents=True)
+        except OSError as error:
+            raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def add_topic(self, topic, msgtype, qos=None, definition=None):
+        """Register a topic (done by :meth:`write` when needed).
+
+        Args:
+            qos: list of :func:`qos_profile` as offered by its publishers.
+            definition: (ros2msg text, RIHS01 hash) of a type that Jazzy does not have.
+        """
+        if not topic.startswith("/"):
+            raise BagError(f"{self.directory}: topic '{topic}' must be absolute in a recording: "
+                           f"'/{topic}'")
+        qos = [qos_profile()] if qos is None else qos
+        if definition is None:
+            if msgtype not in self._typestore.fielddefs:
+                raise BagError(f"topic {topic}: the definition of its type {msgtype} is not known")
+            definition = (self._typestore.generate_msgdef(msgtype, ros_version=2)[0],
+                          self._typestore.hash_rihs01(msgtype))
+        text, digest = definition
+        schema = self._writer.register_schema(msgtype, "ros2msg", text.encode())
+        self._channels[topic] = self._writer.register_channel(
+            topic, "cdr", schema, {"offered_qos_profiles": yaml.dump(qos, Dumper=_Dumper),
+                                   "topic_type_hash": digest})
+        self._topics[topic] = {"name": topic, "type": msgtype, "serialization_format": "cdr",
+                               "offered_qos_profiles": qos, "type_description_hash": digest}
+        self.counts[topic] += 0
+
+    def write(self, topic, msgtype, cdr, log_time, publish_time=None, qos=None, definition=None):
+        """Append one message.
+
+        Args:
+            topic, msgtype: names; the topic is registered at its first message.
+            cdr: serialized message with encapsulation.
+            log_time: int nanoseconds, when it was received.
+            publish_time: int nanoseconds, when it was sent or measured; ``log_time`` if unknown.
+
+        Raises:
+            BagError: the disk is full or the topic's type changed; what was written stays.
+        """
+        if topic not in self._channels:
+            self.add_topic(topic, msgtype, qos, definition)
+        elif self._topics[topic]["type"] != msgtype:
+            raise BagError(f"{self.directory}: topic {topic} is {self._topics[topic]['type']}, "
+                           f"not {msgtype}")
+        try:
+            self._writer.add_message(self._channels[topic], log_time, bytes(cdr),
+                                     log_time if publish_time is None else publish_time,
+                                     self._sequence[topic])
+            self._flush()
+        except OSError as error:
+            raise BagError(f"{self.directory}: writing failed ({error.strerror}); what was "
+                           "written before stays readable") from error
+        self._sequence[topic] += 1
+        self.counts[topic] += 1
+        self._first = log_time if self._first is None else min(self._first, log_time)
+        self._last = log_time if self._last is None else max(self._last, log_time)
+
+    def _flush(self):
+        # tell() moves only when the mcap writer has completed a chunk.
+        position = self._stream.tell()
+        if position != self._position:
+            self._stream.flush()
+            self._position = position
+
+    def close(self):
+        """Write index and metadata; safe to call twice.
+
+        Raises:
+            BagError: the disk is full; complete chunks stay readable.
+        """
+        if self._stream.closed:
+            return
+        try:
+            self._writer.finish()
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self._write_metadata()
+        except OSError as error:
+            raise BagError(f"{self.directory}: closing failed ({error.strerror}); complete "
+                           "chunks stay readable") from error
+        finally:
+            try:
+                self._stream.close()
+            except OSError:
+                pass  # reported above
+
+    def abandon(self):
+        """Close the file as it is, after an error: no index, chunks stay readable."""
+        try:
+            self._stream.close()
+        except OSError:
+            pass
+
+    def _write_metadata(self):
+        first = 0 if self._first is None else self._first
+        duration = 0 if self._last is None else self._last - first
+        total = sum(self.counts.values())
+        times = {"starting_time": {"nanoseconds_since_epoch": first},
+                 "duration": {"nanoseconds": duration}, "message_count": total}
+        information = {
+            "version": 9, "storage_identifier": "mcap", **times,
+            "relative_file_paths": [self._file],
+            "topics_with_message_count": [
+                {"topic_metadata": metadata, "message_count": self.counts[topic]}
+                for topic, metadata in self._topics.items()],
+            "compression_format": "", "compression_mode": "",
+            "files": [{"path": self._file, **times}],
+            "custom_data": None, "ros_distro": "jazzy"}
+        # Under another name first: a metadata.yaml that exists is complete.
+        temporary = self.directory / "metadata.yaml.part"
+        temporary.write_text(yaml.dump({"rosbag2_bagfile_information": information},
+                                       Dumper=_Dumper, sort_keys=False))
+        os.replace(temporary, self.directory / "metadata.yaml")
+
+
+def repair(path, directory):
+    """Copy all that can be read of ``path`` into a new, clean recording.
+
+    Returns:
+        dict of topic to number of messages.
+    """
+    with open_bag(path) as reader, BagWriter(directory, typestore=reader.typestore) as writer:
+        for topic, msgtype, log_time, cdr in reader.messages():
+            writer.write(topic, msgtype, cdr, log_time, qos=reader.topics[topic].qos_profiles)
+        return dict(writer.counts)

@@ -1,0 +1,199 @@
+"""Samples and estimates to and from the bytes of ROS messages.
+
+Nodes and batch call the same functions, so that both write the same messages.
+
+Covariances: zeros mean unknown, a first element of -1 means that the quantity
+is absent (sensor_msgs/Imu). The orientation covariance of a published Imu is
+about the fixed axes of the world, as geometry_msgs/PoseWithCovariance words it;
+estimators keep it about the axes of the sensor.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import TopicError
+from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
+from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3
+from imu_fusion.samples import (AttitudeLog, FixLog, ImuLog, MagLog, PoseLog,
+                                VelocityLog)
+
+UNKNOWN = np.zeros((3, 3))
+ABSENT = np.zeros((3, 3))
+ABSENT[0, 0] = -1.0
+_COVARIANCE_KNOWN = 3
+
+
+def imu_message(stamp, frame_id, gyr, acc, quat=None, cov_orientation=UNKNOWN, cov_gyr=UNKNOWN,
+                cov_acc=UNKNOWN):
+    """CDR bytes of a sensor_msgs/Imu.
+
+    Args:
+        stamp: int nanoseconds.
+        gyr, acc: (3,) rad/s and m/s^2 (specific force), or None where absent.
+        quat: (4,) xyzw world <- sensor, or None where absent.
+        cov_orientation: (3, 3) rad^2 about world axes; cov_gyr, cov_acc: (3, 3).
+    """
+    values = np.zeros(IMU.size)
+    for field, value, cov in (("orientation", quat, cov_orientation),
+                              ("angular_velocity", gyr, cov_gyr),
+                              ("linear_acceleration", acc, cov_acc)):
+        if value is None:
+            cov = ABSENT
+        else:
+            values[IMU[field]] = value
+        values[IMU[field + "_covariance"]] = np.reshape(cov, 9)
+    if quat is None:
+        values[IMU["orientation"]] = (0.0, 0.0, 0.0, 1.0)
+    return IMU.encode(stamp, frame_id, values)
+
+
+def mag_message(stamp, frame_id, mag, cov=UNKNOWN):
+    """CDR bytes of a sensor_msgs/MagneticField. mag: (3,) tesla, cov: (3, 3) tesla^2."""
+    return MAG.encode(stamp, frame_id, np.concatenate([np.asarray(mag, float), np.reshape(cov, 9)]))
+
+
+def fix_message(stamp, frame_id, latitude_deg, longitude_deg, height, cov_enu=None, status=0,
+                service=1):
+    """CDR bytes of a sensor_msgs/NavSatFix. height: ellipsoidal m, cov_enu: (3, 3) m^2 or None."""
+    known = cov_enu is not None
+    cov = np.reshape(cov_enu, 9) if known else np.zeros(9)
+    return FIX.encode(stamp, frame_id, [status, service, latitude_deg, longitude_deg, height, *cov,
+                                        _COVARIANCE_KNOWN if known else 0])
+
+
+def velocity_message(stamp, frame_id, vel_world, cov_world=None):
+    """CDR bytes of a geometry_msgs/TwistWithCovarianceStamped. vel_world: (3,) m/s ENU."""
+    cov = np.zeros((6, 6))
+    if cov_world is not None:
+        cov[:3, :3] = cov_world
+    cov[3, 3] = -1.0  # no angular velocity here
+    return TWIST.encode(stamp, frame_id,
+                        np.concatenate([np.asarray(vel_world, float), np.zeros(3), cov.ravel()]))
+
+
+def pose_message(stamp, frame_id, quat_world_imu, position_world=(0.0, 0.0, 0.0)):
+    """CDR bytes of a geometry_msgs/PoseStamped."""
+    return POSE.encode(stamp, frame_id, [*position_world, *quat_world_imu])
+
+
+def orientation_message(row, frame_id):
+    """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator."""
+    rotation = quat_to_matrix(row["quat_world_imu"])
+    return imu_message(row["stamp"], frame_id, row["gyr"], row["acc"], row["quat_world_imu"],
+                       rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
+
+
+def rpy_message(row, frame_id):
+    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of one row."""
+    return VECTOR3.encode(row["stamp"], frame_id, quat_to_rpy(row["quat_world_imu"]))
+
+
+def bool_message(value):
+    """CDR bytes of a std_msgs/Bool."""
+    return b"\x00\x01\x00\x00\x01" if value else b"\x00\x01\x00\x00\x00"
+
+
+def bool_value(cdr):
+    """The value of a CDR std_msgs/Bool."""
+    return cdr[4] == 1
+
+
+def imu_values(values):
+    """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
+    result = np.concatenate([values[..., IMU["angular_velocity"]],
+                             values[..., IMU["linear_acceleration"]]], axis=-1)
+    for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_acceleration")):
+        absent = values[..., IMU[field + "_covariance"].start] == -1.0
+        result[..., part][absent] = np.nan
+    return result
+
+
+def mag_values(values):
+    """Field (..., 3) of decoded sensor_msgs/MagneticField values."""
+    return values[..., MAG["magnetic_field"]]
+
+
+def _frame(frames, default):
+    return frames[0] if frames else default
+
+
+def _covariance(values, field):
+    return values[:, field].reshape(-1, 3, 3)
+
+
+def imu_log(messages):
+    """ImuLog of a list of CDR sensor_msgs/Imu, in the order given."""
+    stamp, frames, values = IMU.decode_many(messages)
+    samples = imu_values(values)
+    return ImuLog(stamp, samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
+
+
+def mag_log(messages):
+    """MagLog of a list of CDR sensor_msgs/MagneticField."""
+    stamp, frames, values = MAG.decode_many(messages)
+    return MagLog(stamp, mag_values(values), _frame(frames, "imu_link"))
+
+
+def fix_log(messages):
+    """FixLog of a list of CDR sensor_msgs/NavSatFix."""
+    stamp, frames, values = FIX.decode_many(messages)
+    return FixLog(stamp, values[:, 2], values[:, 3], values[:, 4],
+                  _covariance(values, FIX["position_covariance"]), values[:, 0],
+                  _frame(frames, "gnss"))
+
+
+def velocity_log(messages):
+    """VelocityLog of a list of CDR geometry_msgs/TwistWithCovarianceStamped."""
+    stamp, frames, values = TWIST.decode_many(messages)
+    cov = values[:, TWIST["covariance"]].reshape(-1, 6, 6)[:, :3, :3]
+    return VelocityLog(stamp, values[:, TWIST["linear"]], cov, _frame(frames, "world"))
+
+
+def pose_log(messages):
+    """PoseLog of a list of CDR geometry_msgs/PoseStamped."""
+    stamp, frames, values = POSE.decode_many(messages)
+    return PoseLog(stamp, values[:, POSE["orientation"]], values[:, POSE["position"]],
+                   _frame(frames, "world"))
+
+
+def attitude_log(messages):
+    """AttitudeLog of a list of CDR sensor_msgs/Imu with orientation, such as imu/data.
+
+    Raises:
+        TopicError: the messages say that they carry no orientation.
+    """
+    stamp, frames, values = IMU.decode_many(messages)
+    cov_world = _covariance(values, IMU["orientation_covariance"])
+    if (cov_world[:, 0, 0] == -1.0).any():
+        raise TopicError("these sensor_msgs/Imu carry no orientation (covariance[0] is -1): they "
+                         "are raw data, not estimates")
+    quat = values[:, IMU["orientation"]]
+    rotation = Rotation.from_quat(quat).as_matrix() if len(quat) else np.empty((0, 3, 3))
+    samples = imu_values(values)
+    return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,
+                       samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
+
+
+LOGS = {IMU.msgtype: imu_log, MAG.msgtype: mag_log, FIX.msgtype: fix_log,
+        TWIST.msgtype: velocity_log, POSE.msgtype: pose_log}
+
+
+def read_log(reader, topic, log_of=None):
+    """The log of one topic of an open recording.
+
+    Args:
+        reader: what :func:`imu_fusion.messages.bag.open_bag` returned.
+        topic: name, with or without leading slash.
+        log_of: function of a list of messages, if not the one of the type in LOGS
+            (such as :func:`attitude_log`).
+
+    Raises:
+        TopicError: no such topic, or a type that has no log.
+        MessageError: bytes that do not fit the type.
+    """
+    info = reader.require(topic)
+    log_of = log_of or LOGS.get(info.msgtype)
+    if log_of is None:
+        raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
+                         f"logs exist for {', '.join(sorted(LOGS))}")
+    return log_of([cdr for *_, cdr in reader.messages([info.name])])

@@ -1,0 +1,164 @@
+"""CDR bytes of the messages that carry samples and estimates, without ROS.
+
+A :class:`Layout` describes a message that is a ``std_msgs/Header`` followed by
+numbers. Decoding such bytes costs about a microsecond; live nodes and batch use
+the same code, so that both write the same bytes.
+
+Only plain CDR (little or big endian) occurs in ROS 2 bags and on the wire of
+the default middleware; anything else is refused.
+"""
+
+import struct
+
+import numpy as np
+
+from imu_fusion.errors import MessageError
+
+NANOSECONDS = 1_000_000_000
+_LITTLE = b"\x00\x01\x00\x00"
+
+
+class Layout:
+    """One message type: a header, numbers before, doubles, numbers after.
+
+    Args:
+        msgtype: ROS name, such as ``sensor_msgs/msg/Imu``.
+        before, after: struct codes of the numbers around the doubles.
+        child: whether a second string follows the frame id (``child_frame_id``).
+        doubles: field names and their numbers of doubles, in order.
+
+    ``layout["field"]`` is the slice of a field in the flat values, which hold
+    the numbers before, the doubles and the numbers after, all as float64.
+    """
+
+    def __init__(self, msgtype, before="", after="", child=False, **doubles):
+        self.msgtype = msgtype
+        self.child = child
+        self._before, self._after = before, after
+        self._count = sum(doubles.values())
+        self._slices = {}
+        position = len(before)
+        for name, count in doubles.items():
+            self._slices[name] = slice(position, position + count)
+            position += count
+        self.size = position + len(after)
+        self._prefixes = {}
+        self._rest = {order: struct.Struct(f"{order}{self._count}d{after}") for order in "<>"}
+
+    def __getitem__(self, field):
+        return self._slices[field]
+
+    def decode(self, cdr):
+        """Decode one message.
+
+        Args:
+            cdr: bytes with the four bytes of the encapsulation.
+
+        Returns:
+            (stamp int nanoseconds, frame id str, values (size,) float64)
+
+        Raises:
+            MessageError: the bytes are not one message of this type.
+        """
+        try:
+            order = self._order(cdr)
+            sec, nanosec, length = struct.unpack_from(order + "iII", cdr, 4)
+            end = 16 + length
+            if length < 1 or end > len(cdr) or nanosec >= NANOSECONDS:
+                raise MessageError(f"{self.msgtype}: header with a frame id of {length} bytes and "
+                                   f"{nanosec} ns in a message of {len(cdr)} bytes")
+            frame_id = bytes(cdr[16:end - 1]).decode("utf-8", "replace")
+            if self.child:
+                start = 4 + _align(end - 4, 4)
+                (length,) = struct.unpack_from(order + "I", cdr, start)
+                end = start + 4 + length
+            values = ()
+            for code in self._before:
+                size = struct.calcsize(code)
+                end = 4 + _align(end - 4, size)
+                values += struct.unpack_from(order + code, cdr, end)
+                end += size
+            values += self._rest[order].unpack_from(cdr, 4 + _align(end - 4, 8))
+        except (struct.error, IndexError) as error:
+            raise MessageError(f"{self.msgtype}: {len(cdr)} bytes are too few ({error})") from None
+        return sec * NANOSECONDS + nanosec, frame_id, np.array(values, dtype=np.float64)
+
+    def decode_many(self, messages):
+        """Decode a list of messages at once.
+
+        Returns:
+            (stamps (n,) int64, frame ids list of str, values (n, size) float64)
+        """
+        n = len(messages)
+        stamps = np.empty(n, dtype=np.int64)
+        values = np.empty((n, self.size))
+        frames = []
+        for i, cdr in enumerate(messages):
+            stamps[i], frame_id, values[i] = self.decode(cdr)
+            frames.append(frame_id)
+        return stamps, frames, values
+
+    def encode(self, stamp, frame_id, values, child_frame_id=""):
+        """The CDR bytes of one message (little endian, padding zero).
+
+        Args:
+            stamp: int nanoseconds.
+            frame_id: str.
+            values: sequence of ``size`` numbers, in the order of :meth:`decode`.
+        """
+        key = (frame_id, child_frame_id)
+        prefix = self._prefixes.get(key)
+        if prefix is None:
+            prefix = _string(frame_id)
+            if self.child:
+                prefix = _pad(prefix, 4) + _string(child_frame_id)
+            if len(self._prefixes) < 64:  # frame ids come from outside
+                self._prefixes[key] = prefix
+        sec, nanosec = divmod(int(stamp), NANOSECONDS)
+        body = struct.pack("<iI", sec, nanosec) + prefix
+        for code, value in zip(self._before, values):
+            body = _pad(body, struct.calcsize(code)) + struct.pack("<" + code, int(value))
+        first = len(self._before)
+        last = first + self._count
+        body = _pad(body, 8) + np.asarray(values[first:last], dtype="<f8").tobytes()
+        for code, value in zip(self._after, values[last:]):
+            body = _pad(body, struct.calcsize(code)) + struct.pack("<" + code, int(value))
+        return _LITTLE + body
+
+    def _order(self, cdr):
+        if len(cdr) < 16 or cdr[0] != 0 or cdr[1] not in (0, 1):
+            raise MessageError(f"{self.msgtype}: {len(cdr)} bytes that do not start as plain CDR")
+        return "<" if cdr[1] == 1 else ">"
+
+
+def _align(position, size):
+    return -(-position // size) * size
+
+
+def _pad(data, size):
+    return data + b"\0" * (_align(len(data), size) - len(data))
+
+
+def _string(text):
+    data = text.encode("utf-8") + b"\0"
+    return struct.pack("<I", len(data)) + data
+
+
+IMU = Layout("sensor_msgs/msg/Imu", orientation=4, orientation_covariance=9,
+             angular_velocity=3, angular_velocity_covariance=9,
+             linear_acceleration=3, linear_acceleration_covariance=9)
+MAG = Layout("sensor_msgs/msg/MagneticField", magnetic_field=3, magnetic_field_covariance=9)
+# status, service; then latitude, longitude, altitude and the covariance; then its type
+FIX = Layout("sensor_msgs/msg/NavSatFix", before="bH", after="B", latitude=1, longitude=1,
+             altitude=1, position_covariance=9)
+TWIST = Layout("geometry_msgs/msg/TwistWithCovarianceStamped", linear=3, angular=3, covariance=36)
+POSE = Layout("geometry_msgs/msg/PoseStamped", position=3, orientation=4)
+ACCEL = Layout("geometry_msgs/msg/AccelWithCovarianceStamped", linear=3, angular=3, covariance=36)
+VECTOR3 = Layout("geometry_msgs/msg/Vector3Stamped", vector=3)
+ODOMETRY = Layout("nav_msgs/msg/Odometry", child=True, position=3, orientation=4,
+                  pose_covariance=36, linear=3, angular=3, twist_covariance=36)
+
+BOOL_TYPE = "std_msgs/msg/Bool"  # no header, no layout: see convert.bool_message
+
+LAYOUTS = {layout.msgtype: layout
+           for layout in (IMU, MAG, FIX, TWIST, POSE, ACCEL, VECTOR3, ODOMETRY)}

@@ -1,0 +1,246 @@
+"""What all nodes share: parameters from dataclasses, diagnostics, start and orderly end."""
+
+import importlib
+import signal
+import sys
+import time
+
+import rclpy
+import rclpy.node
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import (
+    FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+
+IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
+
+_ROS_TYPES = {
+    (float, False): Parameter.Type.DOUBLE, (float, True): Parameter.Type.DOUBLE_ARRAY,
+    (int, False): Parameter.Type.INTEGER, (int, True): Parameter.Type.INTEGER_ARRAY,
+    (bool, False): Parameter.Type.BOOL, (bool, True): Parameter.Type.BOOL_ARRAY,
+    (str, False): Parameter.Type.STRING, (str, True): Parameter.Type.STRING_ARRAY}
+
+# Parameters that belong to rclpy, not to us.
+_FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+
+
+def message_class(msgtype):
+    """The Python class of 'package/msg/Name'.
+
+    Raises:
+        TopicError: no such type is installed.
+    """
+    try:
+        package, kind, name = msgtype.split("/")
+        return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    except (ImportError, AttributeError, ValueError):
+        raise TopicError(f"message type {msgtype} is not installed here; install the ROS package "
+                         f"'{msgtype.split('/')[0]}' or leave its topics out") from None
+
+
+def descriptor(info):
+    """The rcl_interfaces ParameterDescriptor of a ParameterInfo."""
+    text = f"{info.doc} [{info.unit}]" if info.unit else info.doc
+    result = ParameterDescriptor(name=info.name, description=text, read_only=info.read_only,
+                                 additional_constraints=info.describe_bounds())
+    bounded = info.low is not None or info.high is not None
+    if bounded and not info.is_tuple and info.element is float:
+        result.floating_point_range = [FloatingPointRange(
+            from_value=float("-inf") if info.low is None else float(info.low),
+            to_value=float("inf") if info.high is None else float(info.high))]
+    elif bounded and not info.is_tuple and info.element is int:
+        result.integer_range = [IntegerRange(
+            from_value=-2**63 if info.low is None else int(info.low),
+            to_value=2**63 - 1 if info.high is None else int(info.high), step=1)]
+    return result
+
+
+class Node(rclpy.node.Node):
+    """Base of our nodes.
+
+    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses.
+    Unknown parameters, wrong types and values out of bounds raise ParameterError.
+    """
+
+    NAME = ""
+    PARAMETERS = ()
+
+    def __init__(self, **kwargs):
+        super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
+                         **kwargs)
+        self.finished = False
+        self._params = self._declare()
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self._diagnostics = None
+
+    def params(self, cls):
+        """The present values of one of the node's PARAMETERS dataclasses."""
+        return self._params[cls]
+
+    def work(self):
+        """Called between callbacks; returns the seconds that the executor may wait."""
+        return IDLE
+
+    def stop(self):
+        """Asked to end (signal): do what is needed until ``finished`` is true."""
+        self.finished = True
+
+    def close(self):
+        """Release files; called once, whatever happened."""
+
+    def start_diagnostics(self, status):
+        """Publish ``status() -> (level, message, {key: value})`` on `diagnostics` at 1 Hz."""
+        self._diagnostics = self.create_publisher(DiagnosticArray, "diagnostics", 10)
+
+        def publish():
+            level, message, values = status()
+            array = DiagnosticArray(status=[DiagnosticStatus(
+                level=level, name=self.get_fully_qualified_name().lstrip("/"), message=message,
+                values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
+            array.header.stamp = self.get_clock().now().to_msg()
+            self._diagnostics.publish(array)
+
+        self.create_timer(1.0, publish)
+
+    def _declare(self):
+        # rclpy has declared what was given, with the type that it was given in. Take it
+        # back, and declare everything in the type of the dataclass.
+        given = {}
+        for name, parameter in self.get_parameters_by_prefix("").items():
+            if not name.startswith(_FOREIGN):
+                value = parameter.value
+                given[name] = value.tolist() if hasattr(value, "tolist") else value
+                self.undeclare_parameter(name)
+        known = {info.name: info for cls in self.PARAMETERS for info in cls.infos()}
+        unknown = sorted(given.keys() - known.keys())
+        if unknown:
+            raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
+                                 f"known: {', '.join(sorted(known))}")
+        values = {}
+        for cls in self.PARAMETERS:
+            own = {}
+            for info in cls.infos():
+                value = given.get(info.name)
+                if info.name in given and info.is_tuple and not isinstance(value, bool):
+                    own[info.name] = value or ()  # rclpy has no empty lists of a type
+                elif value is not None:
+                    own[info.name] = value
+            values[cls] = cls.from_mapping(own, source=f"node {self.get_name()}")
+            for info in cls.infos():
+                value = getattr(values[cls], info.name.replace(".", "__"))
+                # rclpy cannot tell the type of an empty list: declared as not set.
+                unset = value is None or value == ()
+                self.declare_parameter(
+                    info.name, _ROS_TYPES[info.element, info.is_tuple] if unset else
+                    list(value) if info.is_tuple else value,
+                    descriptor(info), ignore_override=True)
+        return values
+
+    def _on_set_parameters(self, parameters):
+        for parameter in parameters:
+            for cls in self.PARAMETERS:
+                for info in cls.infos():
+                    if info.name == parameter.name:
+                        try:
+                            self._params[cls] = self._params[cls].replace(
+                                **{info.name.replace(".", "__"): parameter.value})
+                        except ParameterError as error:
+                            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def spin(executor, nodes, until, timeout):
+    """Run ``nodes`` until ``until()`` is true or ``timeout`` seconds have passed; for tests.
+
+    Returns:
+        Whether ``until()`` became true.
+    """
+    deadline = time.monotonic() + timeout
+    while not until():
+        if time.monotonic() > deadline:
+            return False
+        executor.spin_once(timeout_sec=min(node.work() for node in nodes))
+    return True
+
+
+def run_node(node_class, args=None):
+    """The main() of a node.
+
+    Runs until the node is finished or SIGINT, SIGTERM or a shutdown of the context
+    arrives; a second signal ends it at once.
+
+    Returns:
+        Exit code: 0 after an orderly end, 1 after an error, which is printed in one line.
+    """
+    arguments = sys.argv if args is None else ["", *args]
+    own = rclpy.utilities.remove_ros_args(arguments)[1:]
+    if own in (["--help"], ["-h"]):
+        print(usage(node_class))
+        return 0
+    if own:
+        return _complain(node_class, f"unexpected argument '{own[0]}'; parameters are given as "
+                         "--ros-args -p name:=value (see --help)")
+    signals = []
+    previous = {number: signal.signal(number, lambda n, frame: signals.append(n))
+                for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        # Our own handlers: rclpy's would close the context before the node can end its
+        # session and its files.
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        _run(node_class, signals)
+        return 0
+    except ImuFusionError as error:
+        return _complain(node_class, error)
+    except Exception as error:
+        if type(error).__module__.startswith("rclpy"):  # e.g. malformed --ros-args
+            return _complain(node_class, " ".join(str(error).split()))
+        raise
+    finally:
+        rclpy.try_shutdown()
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _run(node_class, signals):
+    node = node_class()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    stopping = False
+    try:
+        while rclpy.ok() and not node.finished and len(signals) < 2:
+            if signals and not stopping:
+                stopping = True
+                node.stop()
+            else:
+                executor.spin_once(timeout_sec=node.work())
+    except ExternalShutdownException:
+        pass
+    finally:
+        try:
+            node.close()
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+
+
+def usage(node_class):
+    """The text of --help: what the node does and its parameters."""
+    lines = [node_class.__doc__.strip().splitlines()[0], "",
+             f"usage: {node_class.NAME} [--ros-args -p NAME:=VALUE ... -r FROM:=TO ...]", "",
+             "parameters:"]
+    for cls in node_class.PARAMETERS:
+        for info in cls.infos():
+            default = "unset" if info.default is None else info.default
+            notes = "; ".join(filter(None, [info.unit, info.describe_bounds()]))
+            lines.append(f"  {info.name} = {default}" + (f" [{notes}]" if notes else ""))
+            lines.append(f"      {info.doc}")
+    return "\n".join(lines)
+
+
+def _complain(node_class, error):
+    print(f"{node_class.NAME}: {error}", file=sys.stderr)
+    return 1

@@ -1,0 +1,77 @@
+"""What the nodes of all streaming estimators share: a Stream between DDS topics."""
+
+from dataclasses import dataclass
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from imu_fusion.nodes.base import Node, message_class
+from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
+from imu_fusion.parameters import Parameters, param
+from imu_fusion.samples.guard import Verdict
+
+
+@dataclass(frozen=True)
+class EstimatorNodeParams(Parameters):
+    """What concerns the node, not the estimate."""
+
+    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
+                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
+                         "for repeats of what was lost (replay).")
+
+
+class EstimatorNode(Node):
+    """A node around a :class:`imu_fusion.messages.streams.Stream`; also the relay's stage."""
+
+    def attach(self, stream, outputs):
+        """Subscribe to the stream's inputs and advertise ``outputs`` (topic to type name)."""
+        self._stream = stream
+        self._relay = Relay(self, self)
+        self._outputs = {topic: self._relay.publisher(message_class(msgtype), topic)
+                         for topic, msgtype in outputs.items()}
+        qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
+            self.params(EstimatorNodeParams).qos]()
+        self._names = {}  # resolved name -> ours
+        for topic, (layout, _) in stream.inputs.items():
+            inbox = self._relay.subscribe(message_class(layout.msgtype), topic,
+                                          lambda cdr, _, topic=topic: stream.push(topic, cdr), qos)
+            self._names[inbox.topic] = topic
+        self.start_diagnostics(self._status)
+
+    def emit(self, topic, stamp, cdr):
+        """Publish what the stream has made."""
+        self._outputs[topic].publish(cdr)
+
+    def summary(self):
+        """Values of the estimator for diagnostics; subclasses add theirs."""
+        return {}
+
+    # The stage of the relay: see nodes/flow.py.
+
+    def reset(self, topics):
+        self._stream.reset([self._names[topic] for topic in topics])
+
+    def step(self):
+        return self._stream.step()
+
+    def topic_ended(self, topic):
+        self._stream.topic_ended(self._names[topic])
+
+    def finish(self):
+        self._stream.finish()
+
+    def stop(self):
+        self._relay.close()
+        super().stop()
+
+    def _status(self):
+        guards = self._stream.merged.guards
+        values = dict(self.summary(), held_for_merging=self._stream.merged.held,
+                      bad_messages=self._stream.bad_messages)
+        for topic, guard in guards.items():
+            values[f"{topic} taken"] = guard.counts[Verdict.OK]
+            values |= {f"{topic} {why}": count for why, count in guard.refused().items()}
+        if not any(guard.counts[Verdict.OK] for guard in guards.values()):
+            return DiagnosticStatus.WARN, "no samples yet on " + ", ".join(guards), values
+        if any(guard.refused() for guard in guards.values()) or self._stream.bad_messages:
+            return DiagnosticStatus.WARN, "samples were left out", values
+        return DiagnosticStatus.OK, "running", values

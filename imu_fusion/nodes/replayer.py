@@ -1,0 +1,332 @@
+"""The replayer: a recording as live topics, its bytes undecoded, its stamps untouched."""
+
+import fnmatch
+import sys
+import time
+from dataclasses import dataclass
+
+from rclpy.qos import DurabilityPolicy
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from imu_fusion.errors import ParameterError, TopicError
+from imu_fusion.messages.bag import find_topic, open_bag
+from imu_fusion.nodes.base import Node, message_class, run_node
+from imu_fusion.nodes.flow import DEPTH, END, NEXT, FlowSource, reliable_qos
+from imu_fusion.nodes.progress import Progress
+from imu_fusion.parameters import Parameters, param
+
+_BURST = 50  # messages sent before services and acknowledgements are looked at
+_BLOCKED = 0.05  # s, wait of the executor while nothing may be sent; callbacks end it
+
+
+@dataclass(frozen=True)
+class ReplayerParams(Parameters):
+    """Parameters of the replayer node."""
+
+    bag: str = param("", doc="recording: rosbag2 directory, .mcap, .db3 or ROS 1 .bag")
+    rate: float = param(1.0, doc="speed as a multiple of the recorded pace; 0: as fast as our "
+                        "nodes take it, nothing lost", low=0, read_only=False)
+    foreign_rate: float = param(
+        1.0, doc="speed at rate 0 while nodes that are not ours subscribe: they cannot "
+        "acknowledge; 0: do not regard them", low=0)
+    start_offset: float = param(0.0, doc="skip this much of the recording", unit="s", low=0)
+    duration: float | None = param(None, doc="play this much of the recording", unit="s", low=0)
+    loop: bool = param(False, doc="start again at the end")
+    topics: tuple[str, ...] = param((), doc="topics to play, * and ? permitted; empty: all")
+    exclude: tuple[str, ...] = param((), doc="topics to leave out, * and ? permitted")
+    remap: tuple[str, ...] = param((), doc="renamed topics, each as recorded:=published")
+    clock: float = param(0.0, doc="rate of /clock in real time (at rate 0 in recorded time); "
+                         "0: no /clock", unit="Hz", low=0)
+    wait_for_subscribers: int = param(
+        1, doc="number of nodes that must subscribe before the first message", low=0)
+    wait_for_nodes: tuple[str, ...] = param(
+        (), doc="names of our nodes that must have joined before the first message")
+    wait_timeout: float | None = param(
+        None, doc="give up waiting for subscribers after this time; unset: never", unit="s", low=0)
+    start_paused: bool = param(False, doc="wait for the service resume or step")
+
+
+class Replayer(Node):
+    """Play a recording on its topics.
+
+    Services (std_srvs/Trigger): ~/pause, ~/resume, ~/step (one message).
+    """
+
+    NAME = "replayer"
+    PARAMETERS = (ReplayerParams,)
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        p = self.params(ReplayerParams)
+        if not p.bag:
+            raise ParameterError("parameter 'bag' of node replayer: no recording given; "
+                                 "add -p bag:=PATH")
+        self._bag = open_bag(p.bag)
+        for warning in self._bag.warnings:
+            self.get_logger().warning(warning)
+        self._start = self._bag.start_time + round(p.start_offset * 1e9)
+        self._stop = self._bag.end_time if p.duration is None else min(
+            self._bag.end_time, self._start + round(p.duration * 1e9))
+        if self._start >= self._bag.end_time > 0:
+            raise ParameterError(
+                f"parameter 'start_offset': {p.start_offset} s is beyond the end of {p.bag} "
+                f"({(self._bag.end_time - self._bag.start_time) * 1e-9:.3f} s long)")
+        self._source = FlowSource(self, wait_for=p.wait_for_nodes)
+        self._outputs = self._make_publishers(p)
+        self._clock_out = self.create_publisher(
+            Clock, "/clock", reliable_qos(10)) if p.clock else None
+        self._next_clock = 0
+        self._messages = iter(())
+        self._next = None  # (topic, log time, bytes) that is due next
+        self._phase = self._wait
+        self._waiting_since = time.monotonic()
+        self._last_event = None
+        self._deadline = None  # of an end that was asked for
+        self._paused = p.start_paused
+        self._steps = 0
+        self._pace = 1.0
+        self._anchor = None  # (monotonic time, log time) from which the pace counts
+        self._told = ""
+        self._progress = Progress("replaying", (self._stop - self._start) * 1e-9)
+        self.create_service(Trigger, "~/pause", self._on_pause)
+        self.create_service(Trigger, "~/resume", self._on_resume)
+        self.create_service(Trigger, "~/step", self._on_step)
+        self.create_timer(1.0, self._tell)
+        self.start_diagnostics(lambda: (b"\0", self._phase.__name__.strip("_"), {
+            publisher.topic: publisher.sent for publisher in self._outputs.values()}))
+
+    def work(self):
+        """Do what the present phase asks for; see :meth:`Node.work`."""
+        if self._deadline is not None and time.monotonic() > self._deadline:
+            self.finished = True
+        return self._phase()
+
+    def stop(self):
+        """End the session, so that whoever listens knows; wait for that only briefly."""
+        self._deadline = time.monotonic() + 2.0
+        self._next = None
+        if self._phase == self._wait:
+            self.finished = True
+        elif self._phase != self._drain:
+            self._end(END)
+
+    def close(self):
+        """Close the recording and say what was sent to whom."""
+        self._progress.close()
+        self._bag.close()
+        for topic, (sent, lost) in sorted(self._source.report().items()):
+            takers = [f"{name}" + (f" ({n} LOST)" if n else "") for name, n in lost.items()]
+            takers += [f"{name} (not ours, unchecked)" for name in
+                       self._source.foreign.get(topic, ())]
+            print(f"  {topic}: {sent} messages to {', '.join(takers) or 'nobody'}",
+                  file=sys.stderr)
+
+    def _make_publishers(self, p):
+        """Publishers of the selected topics, by recorded name."""
+        names = _selected(self._bag, p)
+        renamed = _remapping(self._bag, p.remap)
+        publishers = {}
+        for name in names:
+            info = self._bag.topics[name]
+            try:
+                cls = message_class(info.msgtype)
+            except TopicError as error:
+                if p.topics:
+                    raise
+                self.get_logger().warning(f"{name} is not played: {error}")
+                continue
+            latched = any(q["durability"] == "transient_local" for q in info.qos_profiles)
+            publishers[name] = self._source.publisher(cls, renamed.get(name, name), reliable_qos(
+                DEPTH, DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+        if not publishers:
+            raise TopicError(f"{p.bag}: nothing to play; it has "
+                             + (", ".join(self._bag.topics) or "no topics"))
+        return publishers
+
+    # Phases: each does a little and returns the seconds that may pass until its next call.
+
+    def _wait(self):
+        """Nobody is played to before the expected subscribers are there."""
+        p = self.params(ReplayerParams)
+        missing = p.wait_for_subscribers - len(self._subscribers())
+        if missing <= 0:
+            self._begin()
+            return 0.0
+        self._give_up_after(p.wait_timeout, f"{missing} more subscribers of "
+                            + ", ".join(q.topic for q in self._outputs.values()))
+        return _BLOCKED
+
+    def _begin(self):
+        # Asked to end after NEXT has been promised: the next session is empty.
+        if self._deadline is None:
+            self._messages = self._bag.messages(list(self._outputs), self._start, self._stop)
+            self._advance()
+        self._source.begin()
+        self._anchor = None
+        self._next_clock = 0
+        self._waiting_since = time.monotonic()
+        self._phase = self._join
+
+    def _join(self):
+        """All our nodes on the graph must have answered."""
+        if not self._source.ready():
+            self._give_up_after(self.params(ReplayerParams).wait_timeout,
+                                self._source.waiting_for())
+            return _BLOCKED
+        self._told = ""
+        self._phase = self._play
+        return 0.0
+
+    def _play(self):
+        for _ in range(_BURST):
+            if self._next is None:
+                again = self.params(ReplayerParams).loop and self._deadline is None
+                self._end(NEXT if again else END)
+                return 0.0
+            if self._paused and not self._steps:
+                self._anchor = None
+                return _BLOCKED
+            topic, log_time, data = self._next
+            publisher = self._outputs[topic]
+            if not publisher.is_open:
+                return _BLOCKED
+            if not self._steps:
+                wait = self._time_to_wait(log_time)
+                if wait > 0.0:
+                    return min(wait, _BLOCKED)
+            if self._clock_out is not None:
+                self._publish_clock(log_time)
+            publisher.publish(data)
+            self._steps -= self._steps > 0
+            self._advance()
+        return 0.0
+
+    def _drain(self):
+        """Everything is sent; our nodes say when they have it."""
+        if not self._source.drained():
+            return _BLOCKED
+        if self._last_event == NEXT:
+            self._begin()
+        else:
+            self.finished = True
+        return 0.0
+
+    def _end(self, event):
+        self._last_event = event
+        self._source.end(event)
+        self._phase = self._drain
+
+    def _advance(self):
+        item = next(self._messages, None)
+        self._next = None if item is None else (item[0], item[2], item[3])
+        if item is not None:
+            self._progress.update((item[2] - self._start) * 1e-9)
+
+    def _time_to_wait(self, log_time):
+        """Seconds until a message of this log time is due."""
+        p = self.params(ReplayerParams)
+        pace = p.rate
+        if pace == 0.0 and self._source.foreign:
+            pace = p.foreign_rate
+        now = time.monotonic()
+        if self._anchor is None or pace != self._pace:
+            self._anchor, self._pace = (now, log_time), pace
+        if pace == 0.0:
+            return 0.0
+        started, first = self._anchor
+        return started + (log_time - first) * 1e-9 / pace - now
+
+    def _publish_clock(self, log_time):
+        if log_time >= self._next_clock:
+            p = self.params(ReplayerParams)
+            self._clock_out.publish(Clock(clock=Time(nanoseconds=log_time).to_msg()))
+            self._next_clock = log_time + round(1e9 * (p.rate or 1.0) / p.clock)
+
+    def _subscribers(self):
+        """Names of the nodes that subscribe to what is played."""
+        return {(i.node_namespace, i.node_name) for q in self._outputs.values()
+                for i in self.get_subscriptions_info_by_topic(q.topic)}
+
+    def _give_up_after(self, timeout, what):
+        if timeout is not None and time.monotonic() - self._waiting_since > timeout:
+            raise TopicError(f"waited {timeout:g} s in vain for {what}; "
+                             "see wait_for_subscribers, wait_for_nodes and wait_timeout")
+
+    def _tell(self):
+        """Say, once each, what holds the replay up or slows it down."""
+        p = self.params(ReplayerParams)
+        text = ""
+        if self._phase == self._wait:
+            text = "waiting for subscribers"
+        elif self._phase in (self._join, self._drain) or (
+                self._phase == self._play and not self._source.ready()):
+            text = self._source.waiting_for()
+        elif p.rate == 0.0 and self._source.foreign and p.foreign_rate:
+            names = sorted({n for names in self._source.foreign.values() for n in names})
+            text = (f"playing at {p.foreign_rate:g} times the recorded pace, because nodes that "
+                    f"cannot acknowledge subscribe: {', '.join(names)}")
+        if text and text != self._told:
+            self.get_logger().info(text)
+        self._told = text
+
+    def _on_pause(self, request, response):
+        self._paused = True
+        response.success, response.message = True, "paused"
+        return response
+
+    def _on_resume(self, request, response):
+        self._paused = False
+        response.success, response.message = True, "playing"
+        return response
+
+    def _on_step(self, request, response):
+        response.success = self._paused and self._next is not None
+        response.message = "one message follows"
+        if response.success:
+            self._steps += 1
+        else:
+            response.message = "not paused" if not self._paused else "nothing left to play"
+        return response
+
+
+def _selected(bag, p):
+    """Recorded names of the topics to play.
+
+    Raises:
+        TopicError: one that was asked for is not there.
+    """
+    def matches(name, patterns):
+        return any(fnmatch.fnmatchcase(name.lstrip("/"), pattern.lstrip("/"))
+                   for pattern in patterns)
+
+    for pattern in p.topics:
+        if not any(matches(name, [pattern]) for name in bag.topics):
+            bag.require(pattern)
+    return [name for name in bag.topics
+            if (not p.topics or matches(name, p.topics)) and not matches(name, p.exclude)]
+
+
+def _remapping(bag, rules):
+    """{recorded name: published name}.
+
+    Raises:
+        ParameterError: a rule is malformed or its topic is not in the recording.
+    """
+    renamed = {}
+    for rule in rules:
+        old, separator, new = rule.partition(":=")
+        name = find_topic(bag.topics, old)
+        if not separator or not new:
+            raise ParameterError(f"parameter 'remap': '{rule}' is not recorded:=published")
+        if name is None:
+            raise ParameterError(f"parameter 'remap': no topic '{old}' in the recording; it has: "
+                                 + ", ".join(bag.topics))
+        renamed[name] = new
+    return renamed
+
+
+def main(args=None):
+    """Entry point; returns the exit code."""
+    return run_node(Replayer, args)

@@ -1,0 +1,79 @@
+"""ROS 2 parameter files, read without ROS: the same file serves nodes and batch."""
+
+from pathlib import Path
+
+import yaml
+
+from imu_fusion.errors import ParameterError
+from imu_fusion.parameters import flatten
+
+
+def load(path):
+    """Read a parameter file.
+
+    Args:
+        path: YAML keyed by node name (``name:``, ``/ns/name:`` or ``/**:``), each with
+            ``ros__parameters``.
+
+    Returns:
+        dict of node name to (nested) parameters; wildcards under ``**``.
+
+    Raises:
+        ParameterError: not readable, not YAML, or not of that form.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{path}: is not YAML: {error}") from None
+    if content is None:
+        return {}
+    nodes = {}
+    for key, body in _walk(path, content):
+        nodes.setdefault(key, {}).update(body)
+    return nodes
+
+
+def _walk(path, content, prefix=""):
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: '{prefix or 'the top level'}' must map node names to "
+                             "'ros__parameters'")
+    for key, body in content.items():
+        if isinstance(body, dict) and "ros__parameters" in body:
+            name = str(key).rstrip("/").rpartition("/")[2]
+            yield name, body["ros__parameters"] or {}
+        else:
+            yield from _walk(path, body, f"{prefix}{key}/")
+
+
+def parameters_for(cls, node, path=None, **options):
+    """The parameters of one node from a file, or its defaults without one.
+
+    Args:
+        cls: a :class:`~imu_fusion.parameters.Parameters` class.
+        node: node name; ``/**`` in the file applies to every node, with the names known to it.
+        path: the file, or None.
+        options: passed to ``cls.from_mapping``.
+
+    Raises:
+        ParameterError: as ``cls.from_mapping``, naming the file.
+    """
+    if path is None:
+        return cls()
+    nodes = load(path)
+    known = {info.name for info in cls.infos()}
+    values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
+    values.update(flatten(nodes.get(node, {})))
+    values.pop("use_sim_time", None)
+    for info in cls.infos():
+        if info.path and values.get(info.name):
+            values[info.name] = resolve(values[info.name], path)
+    return cls.from_mapping(values, source=str(path), **options)
+
+
+def resolve(value, parameter_file):
+    """A path from a parameter file: relative ones are relative to the file, if that exists."""
+    candidate = Path(parameter_file).parent / value
+    return str(candidate) if not Path(value).is_absolute() and candidate.exists() else value

@@ -1,0 +1,178 @@
+"""One HTML file that opens offline: sections of text, tables and plotly figures.
+
+A report is a list of :class:`Section`; an estimator adds its own by writing a
+function that returns one. All text that comes from outside (file names, topics,
+frame ids) is escaped here, once.
+"""
+
+import html
+import json
+import re
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import plotly.graph_objects
+import plotly.offline
+
+import imu_fusion
+from imu_fusion.errors import ImuFusionError
+
+
+# A number with its unit, a dash for none, or nothing: columns of these are set to the right.
+_NUMBER = re.compile(r"^([-+]?\d[\d.,]*(e[-+]?\d+)?( ?\S{1,4})?|–|)$")
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+    def render(self):
+        return f"<p>{html.escape(self.text)}</p>"
+
+
+@dataclass(frozen=True)
+class Notes:
+    """A list of remarks; ``warning`` sets them apart."""
+
+    items: tuple
+    warning: bool = True
+
+    def render(self):
+        rows = "".join(f"<li>{html.escape(item)}</li>" for item in self.items)
+        return f'<ul class="{"warning" if self.warning else "plain"}">{rows}</ul>'
+
+
+@dataclass(frozen=True)
+class Number:
+    """One key number: what it is, its value with unit, a remark."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Key numbers side by side."""
+
+    items: tuple
+
+    def render(self):
+        cards = "".join(
+            f'<div class="card"><div class="label">{html.escape(n.label)}</div>'
+            f'<div class="value">{html.escape(n.value)}</div>'
+            f'<div class="note">{html.escape(n.note)}</div></div>' for n in self.items)
+        return f'<div class="cards">{cards}</div>'
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells (text as it shall appear) below a header; columns of numbers are set to the
+    right."""
+
+    header: tuple
+    rows: tuple
+    caption: str = ""
+
+    def render(self):
+        numeric = [all(_NUMBER.match(str(row[i])) for row in self.rows) for i in
+                   range(len(self.header))]
+        head = "".join(self._cell("th", *pair) for pair in zip(self.header, numeric))
+        body = "".join("<tr>" + "".join(self._cell("td", *pair) for pair in zip(row, numeric))
+                       + "</tr>" for row in self.rows)
+        caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
+        return (f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead>'
+                f"<tbody>{body}</tbody></table></div>")
+
+    @staticmethod
+    def _cell(tag, content, numeric):
+        kind = ' class="number"' if numeric else ""
+        return f"<{tag}{kind}>{html.escape(str(content))}</{tag}>"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plotly figure; ``linked`` ties its time axis to those of the other figures."""
+
+    figure: plotly.graph_objects.Figure
+    caption: str = ""
+    linked: bool = True
+
+    def render(self):
+        # Inside <script> only "<" could end the element or open a comment.
+        data = self.figure.to_json().replace("<", "\\u003c").replace(">", "\\u003e") \
+            .replace("&", "\\u0026").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+        caption = f"<figcaption>{html.escape(self.caption)}</figcaption>" if self.caption else ""
+        height = int(self.figure.layout.height or 450)
+        return (f'<figure><div class="plot{" linked" if self.linked else ""}" '
+                f'style="height:{height}px"></div>'
+                f'<script type="application/json">{data}</script>{caption}</figure>')
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and its blocks (Text, Notes, Numbers, Table, Figure)."""
+
+    title: str
+    blocks: tuple
+
+
+def write_report(path, title, sections, subtitle=""):
+    """Write one self-contained HTML file.
+
+    Args:
+        path: file to write; its folder is made if it is missing.
+        title, subtitle: heading and the line below it.
+        sections: list of Section.
+
+    Raises:
+        ImuFusionError: the file cannot be written.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(render_report(title, sections, subtitle), encoding="utf-8")
+    except OSError as error:
+        raise ImuFusionError(f"{path}: the report cannot be written ({error.strerror})") from None
+
+
+def render_report(title, sections, subtitle=""):
+    """The HTML text of :func:`write_report`."""
+    anchors = [re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
+               for section in sections]
+    links = "".join(f'<a href="#{anchor}">{html.escape(section.title)}</a>'
+                    for anchor, section in zip(anchors, sections))
+    body = "".join(
+        f'<section id="{anchor}"><h2>{html.escape(section.title)}</h2>'
+        + "".join(block.render() for block in section.blocks) + "</section>"
+        for anchor, section in zip(anchors, sections))
+    style, script = (files(__package__).joinpath(name).read_text(encoding="utf-8")
+                     for name in ("report.css", "report.js"))
+    config = json.dumps({"responsive": True, "displaylogo": False,
+                         "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"]})
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title>
+<style>{style}</style>
+</head>
+<body>
+<header><h1>{html.escape(title)}</h1><p>{html.escape(subtitle)}</p><nav>{links}</nav></header>
+<main>
+<noscript><p class="warning">The figures need JavaScript; numbers and tables do not.</p></noscript>
+{body}
+</main>
+<footer>Written by imu_fusion {imu_fusion.__version__}. The figures show the greatest and least
+value of every stretch of a long signal; drag to zoom, double-click to go back: the time axes
+move together.</footer>
+<script>{plotly.offline.get_plotlyjs()}</script>
+<script>const plotConfig = {config};
+{script}</script>
+</body>
+</html>
+"""

@@ -1,0 +1,85 @@
+"""Which samples are fit for use: one rule for live nodes, replay and batch.
+
+A sample is refused, and counted, if a value is not finite, if its stamp repeats
+the last one of its topic, or if its stamp is older than that by at most
+``JUMP_BACK`` (it was overtaken on the way). An older stamp than that means that
+the clock was set back (a simulation or a replay starts over): a new *epoch*
+begins, and estimators start anew with it.
+"""
+
+import enum
+from collections import Counter
+
+import numpy as np
+
+JUMP_BACK = 1_000_000_000
+"""Nanoseconds. Transport delays reorder samples by less, restarts go back by more."""
+
+
+class Verdict(enum.Enum):
+    """Why a sample was refused; OK if it was not."""
+
+    OK = "ok"
+    NOT_FINITE = "not finite (NaN, infinite or absent)"
+    DUPLICATE = "repeated stamp"
+    BACKWARDS = "stamp older than the one before"
+
+
+class Guard:
+    """The rule for one topic; ``epoch`` counts the clock's jumps back."""
+
+    def __init__(self):
+        self.epoch = 0
+        self.last = None
+        self.counts = Counter()
+
+    def check(self, stamp, values):
+        """Judge the next sample.
+
+        Args:
+            stamp: int nanoseconds.
+            values: float64 array of any shape.
+
+        Returns:
+            Verdict; ``self.epoch`` is that of this sample.
+        """
+        verdict = Verdict.OK
+        if not np.isfinite(values).all():
+            verdict = Verdict.NOT_FINITE
+        elif self.last is not None and stamp <= self.last:
+            if stamp == self.last:
+                verdict = Verdict.DUPLICATE
+            elif self.last - stamp <= JUMP_BACK:
+                verdict = Verdict.BACKWARDS
+            else:
+                self.epoch += 1
+        if verdict is Verdict.OK:
+            self.last = stamp
+        self.counts[verdict] += 1
+        return verdict
+
+    def refused(self):
+        """Counts of what was refused, in words."""
+        return {verdict.value: count for verdict, count in self.counts.items()
+                if verdict is not Verdict.OK and count}
+
+
+def guard_log(log):
+    """The usable samples of a whole log.
+
+    Returns:
+        (log of what is fit for use, epochs (n,) int64 of its samples, Guard with the counts)
+    """
+    values = log.flat()
+    guard = Guard()
+    steps = np.diff(log.stamp)
+    if len(log) and np.isfinite(values).all() and (steps > 0).all():
+        guard.counts[Verdict.OK] = len(log)
+        guard.last = int(log.stamp[-1])
+        return log, np.zeros(len(log), dtype=np.int64), guard
+    keep = np.zeros(len(log), dtype=bool)
+    epochs = np.zeros(len(log), dtype=np.int64)
+    for i in range(len(log)):
+        keep[i] = guard.check(int(log.stamp[i]), values[i]) is Verdict.OK
+        epochs[i] = guard.epoch
+    return log[keep], epochs[keep], guard

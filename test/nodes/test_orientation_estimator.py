@@ -1,0 +1,153 @@
+"""The orientation node: equal to batch, live without waiting, controllable, orderly."""
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from sensor_msgs.msg import Imu, MagneticField
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from imu_fusion import batch
+from imu_fusion.errors import ParameterError
+from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.messages.layouts import IMU, LAYOUTS, MAG
+from imu_fusion.messages.orientation_stream import OUTPUTS as TYPES
+from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode
+from imu_fusion.nodes.replayer import Replayer
+from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from test.nodes.conftest import collector
+
+OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool}
+NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
+
+
+@pytest.fixture(scope="module")
+def recording():
+    imu, mag, _ = simulate(Tumbling(seed=3), 12.0, rate=200.0, mag_rate=47.0, sensors=NOISY,
+                           seed=4)[:3]
+    return imu, mag
+
+
+def write(path, imu, mag, faults=True):
+    """The recording with what real ones have: late arrival, repeats, NaN, a clock set back."""
+    rows = [(int(s) + 2_000_000, 0, i) for i, s in enumerate(imu.stamp)]
+    rows += [(int(s) + 9_000_000, 1, i) for i, s in enumerate(mag.stamp)]
+    with BagWriter(path) as writer:
+        for log_time, kind, i in sorted(rows):
+            if kind == 0:
+                stamp, gyr = int(imu.stamp[i]), imu.gyr[i].copy()
+                if faults and i == 700:
+                    gyr[1] = np.nan
+                if faults and i == 900:
+                    stamp = int(imu.stamp[899])
+                if faults and i >= 1500:
+                    stamp -= 3_000_000_000
+                cdr = imu_message(stamp, "ball", gyr, imu.acc[i])
+                writer.write("/imu/data_raw", IMU.msgtype, cdr, log_time)
+            else:
+                stamp = int(mag.stamp[i])
+                if faults and log_time >= imu.stamp[1500]:
+                    stamp -= 3_000_000_000
+                writer.write("/imu/mag", MAG.msgtype, mag_message(stamp, "ball", mag.mag[i]),
+                             log_time)
+    return path
+
+
+def fields(topic, cdr):
+    """All decoded fields of a message, as bytes so that NaN equals itself."""
+    msgtype = TYPES[topic.lstrip("/")]
+    if msgtype not in LAYOUTS:
+        return bytes(cdr[4:5])
+    stamp, frame_id, values = LAYOUTS[msgtype].decode(cdr)
+    return stamp, frame_id, values.tobytes()
+
+
+def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_path):
+    bag = write(tmp_path / "bag", *recording)
+    batch.process(bag, tmp_path / "out")
+    sink = collector(graph, topics=OUTPUTS)
+    graph.start(OrientationEstimatorNode, qos="reliable")
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
+    graph.until(lambda: replayer.finished and sink.ended)
+    with open_bag(tmp_path / "out") as reader:
+        for topic in OUTPUTS:
+            live = [fields(topic, cdr) for cdr in sink.messages[topic]]
+            offline = [fields(topic, m[3]) for m in reader.messages([topic])]
+            # Two epochs: in the recording of batch, log times (stamps) interleave.
+            assert sorted(live) == sorted(offline), topic
+            if topic == "/imu/data":
+                assert len(offline) == len(recording[0]) - 2
+
+
+def test_another_pass_gives_the_same_again(graph, recording, tmp_path):
+    bag = write(tmp_path / "bag", *recording, faults=False)
+    sink = collector(graph, topics={"/imu/data": Imu})
+    graph.start(OrientationEstimatorNode, qos="reliable")
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0, loop=True)
+    graph.until(lambda: len(sink.ended) >= 2)
+    replayer.stop()
+    graph.until(lambda: replayer.finished)
+    n = len(recording[0])
+    first, second = sink.messages["/imu/data"][:n], sink.messages["/imu/data"][n:2 * n]
+    assert [fields("/imu/data", c) for c in first] == [fields("/imu/data", c) for c in second]
+
+
+def test_live_answers_every_imu_without_waiting_for_the_magnetometer(graph, recording):
+    imu, _ = recording
+    node = graph.node("driver")
+    raw = node.create_publisher(Imu, "/imu/data_raw", 1000)
+    node.create_publisher(MagneticField, "/imu/mag", 1000)  # says nothing
+    graph.start(OrientationEstimatorNode)
+    heard = []
+    node.create_subscription(Imu, "/imu/data", lambda m: heard.append(m), 1000)
+    graph.until(lambda: raw.get_subscription_count() == 1)
+    for i in range(500):
+        raw.publish(imu_message(int(imu.stamp[i]), "ball", imu.gyr[i], imu.acc[i]))
+        graph.executor.spin_once(timeout_sec=0)
+    graph.until(lambda: len(heard) == 500)
+    assert heard[-1].header.frame_id == "ball"
+    stamp = heard[-1].header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == imu.stamp[499]
+
+
+def test_reset_service_starts_anew(graph, recording):
+    imu, _ = recording
+    node = graph.node("driver")
+    raw = node.create_publisher(Imu, "/imu/data_raw", 1000)
+    estimator = graph.start(OrientationEstimatorNode)
+    graph.until(lambda: raw.get_subscription_count() == 1)
+    for i in range(400):
+        raw.publish(imu_message(int(imu.stamp[i]), "ball", imu.gyr[i], imu.acc[i]))
+    summary = estimator._stream.estimator.summary
+    graph.until(lambda: summary()["imu_used"] == 400)
+    response = graph.call(node, Trigger, "/orientation_estimator/reset")
+    assert response.success and response.message
+    assert summary()["imu_used"] == 0 and not summary()["aligned"]
+
+
+def test_diagnostics_say_what_was_left_out(graph, recording):
+    imu, _ = recording
+    node = graph.node("driver")
+    raw = node.create_publisher(Imu, "/imu/data_raw", 1000)
+    said = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: said.extend(m.status), 10)
+    graph.start(OrientationEstimatorNode)
+    graph.until(lambda: raw.get_subscription_count() == 1)
+    for i in (0, 1, 1, 2):
+        raw.publish(imu_message(int(imu.stamp[i]), "ball", imu.gyr[i], imu.acc[i]))
+
+    def told():
+        return any({v.key: v.value for v in s.values}.get("imu/data_raw repeated stamp") == "1"
+                   for s in said if s.name == "orientation_estimator")
+    graph.until(told)
+
+
+@pytest.mark.parametrize("parameters, words", [
+    (dict(method="magic"), "'method'.*'magic'"), (dict(nosie=1.0), "unknown parameter 'nosie'"),
+    (dict(mag_noise_sd=-1.0), "'mag_noise_sd'.*out of bounds"),
+])
+def test_bad_parameters_are_refused_by_name(graph, parameters, words):
+    with pytest.raises(ParameterError, match=words):
+        graph.start(OrientationEstimatorNode, **parameters)

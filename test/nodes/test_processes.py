@@ -1,0 +1,113 @@
+"""The nodes as processes: signals, kill -9, exit codes, messages of user errors."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from sensor_msgs.msg import Imu
+
+from imu_fusion.messages.bag import open_bag
+from imu_fusion.messages.convert import imu_message
+from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
+from test.nodes.conftest import START, STEP, collector
+
+SCRIPTS = Path(sys.executable).parent
+# Killed processes leave shared memory behind; over UDP there is nothing to leave.
+ENVIRONMENT = {**os.environ, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+
+
+def start(node, **parameters):
+    command = [SCRIPTS / node, "--ros-args"]
+    for name, value in parameters.items():
+        command += ["-p", f"{name}:={value}"]
+    return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+
+
+def end(process):
+    _, errors = process.communicate(timeout=60)
+    return process.returncode, errors
+
+
+def test_replay_through_processes_ends_by_itself_and_says_what_it_sent(bag, tmp_path):
+    recorder = start("recorder", out=tmp_path / "out")
+    replayer = start("replayer", bag=bag, rate="0.0", wait_for_nodes="[recorder]",
+                     wait_for_subscribers=0)
+    code, said = end(replayer)
+    assert code == 0 and "/imu/data_raw: 200 messages to /recorder" in said, said
+    code, said = end(recorder)
+    assert code == 0 and "/imu/mag: 50 messages\n" in said, said
+    with open_bag(tmp_path / "out") as reader:
+        assert reader.topics["/imu/data_raw"].count == 200 and not reader.warnings
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_closes_the_recording_with_all_that_was_acknowledged(graph, tmp_path, number):
+    out = tmp_path / "out"
+    recorder = start("recorder", out=out, topics="[/imu/data_raw]")
+    source = FlowSource(graph.node("talker"), wait_for=["recorder"])
+    publisher = source.publisher(Imu, "/imu/data_raw")
+    source.begin()
+    graph.until(source.ready)
+    for i in range(2 * ACK_EVERY):
+        publisher.publish(imu_message(START + i * STEP, "imu_link", (0, 0, 0), (i, 0, 0)))
+    graph.until(lambda: source.acknowledged("/imu/data_raw") == 2 * ACK_EVERY)
+    recorder.send_signal(number)
+    code, said = end(recorder)
+    assert code == 0 and "Traceback" not in said, said
+    with open_bag(out) as reader:
+        assert not reader.warnings and reader.topics["/imu/data_raw"].count == 2 * ACK_EVERY
+
+
+def test_signal_to_the_replayer_ends_its_session(graph, bag):
+    sink = collector(graph)
+    replayer = start("replayer", bag=bag, rate="0.01")
+    graph.until(lambda: sink.messages["/imu/data_raw"])
+    replayer.send_signal(signal.SIGINT)
+    graph.until(lambda: sink.ended == [END])
+    assert end(replayer)[0] == 0
+
+
+def test_kill_9_of_the_recorder_leaves_all_closed_chunks(graph, tmp_path):
+    """Incompressible chunks of 16 KiB: about 45 messages each; at most one is lost."""
+    out = tmp_path / "out"
+    recorder = start("recorder", out=out, topics="[/imu/data_raw]", chunk_size=16384,
+                     compression="none")
+    publisher = graph.node("talker").create_publisher(Imu, "/imu/data_raw", 1000)
+    graph.until(lambda: publisher.get_subscription_count() == 1)
+    sent = 0
+    file = out / "out_0.mcap"
+    while file.stat().st_size < 200_000:  # a dozen closed chunks
+        publisher.publish(imu_message(START + sent * STEP, "imu_link", (0, 0, 0), (sent, 0, 0)))
+        sent += 1
+        graph.executor.spin_once(timeout_sec=0.001)
+    recorder.kill()
+    recorder.wait(timeout=30)
+    recorder.stderr.close()
+    assert not (out / "metadata.yaml").exists()
+    with open_bag(out) as reader:
+        assert "not closed properly" in reader.warnings[0]
+        found = [m[3] for m in reader.messages()]
+    assert len(found) >= 200_000 // 400
+    assert len({len(m) for m in found}) == 1
+
+
+@pytest.mark.parametrize("node, parameters, text", [
+    ("replayer", {"bag": "/nowhere/bag"}, "replayer: /nowhere/bag: no such file"),
+    ("replayer", {"bag": "/nowhere", "rte": "2.0"}, "unknown parameter 'rte'"),
+    ("recorder", {"out": "/proc/x/y"}, "recorder: /proc/x/y: cannot be written"),
+])
+def test_user_errors_are_one_line_and_exit_code_1(node, parameters, text):
+    code, said = end(start(node, **parameters))
+    assert code == 1 and text in said and len(said.strip().splitlines()) == 1, said
+
+
+def test_help_lists_the_parameters_and_wrong_arguments_are_refused():
+    done = subprocess.run([SCRIPTS / "replayer", "--help"], env=ENVIRONMENT,
+                          capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and "rate = 1.0 [at least 0]" in done.stdout
+    done = subprocess.run([SCRIPTS / "replayer", "my.bag"], env=ENVIRONMENT,
+                          capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "unexpected argument 'my.bag'" in done.stderr

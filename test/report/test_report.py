@@ -1,0 +1,168 @@
+"""The HTML report: self-contained, safe against what files contain, complete, bounded."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import ImuFusionError
+from imu_fusion.messages.bag import BagWriter
+from imu_fusion.messages.convert import imu_message, mag_message, pose_message
+from imu_fusion.report.figures import Line, Panel, break_wraps, intervals, time_figure
+from imu_fusion.report.html import (
+    Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
+from imu_fusion.report.orientation import euler_zyx
+from imu_fusion.report.recording import write_orientation_report
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+START = 1_700_000_000_000_000_000
+EVIL = "</script><script>alert('x')</script><img src=x onerror=alert(1)>&\"'"
+
+
+class Page(HTMLParser):
+    """What a browser would make of a page: tags outside of scripts, texts of scripts."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.tags, self.links, self.text, self.figures = [], [], "", []
+        self._script = None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        self._script = dict(attributes).get("type", "js") if tag == "script" else None
+        self.links += [v for k, v in attributes if k in ("src", "href", "data", "action")]
+
+    def handle_endtag(self, tag):
+        self._script = None
+
+    def handle_data(self, data):
+        if self._script is None:
+            self.text += data
+        elif self._script == "application/json":
+            self.figures.append(json.loads(data))
+
+
+def evil_recording(directory, topic):
+    """A small recording with estimates, whose strings try to break out of the page."""
+    rng = np.random.default_rng(0)
+    with BagWriter(directory) as writer:
+        for i in range(400):
+            stamp = START + i * 10_000_000
+            rotation = Rotation.from_rotvec([0, 0, i * 0.01])
+            body = rotation.inv()
+            gyr, acc = [0, 0, 1.0] + rng.normal(0, 1e-3, 3), [0, 0, 9.81] + rng.normal(0, .05, 3)
+            writer.write("/imu/data_raw", "sensor_msgs/msg/Imu",
+                         imu_message(stamp, EVIL, gyr, acc), stamp)
+            writer.write("/imu/mag", "sensor_msgs/msg/MagneticField", mag_message(
+                stamp, EVIL, body.apply([0, 20e-6, -44e-6]) + rng.normal(0, 1e-7, 3)), stamp)
+            writer.write("/imu/data", "sensor_msgs/msg/Imu", imu_message(
+                stamp, EVIL, gyr, acc, rotation.as_quat(), np.eye(3) * 1e-4), stamp)
+            writer.write(topic, "geometry_msgs/msg/PoseStamped",
+                         pose_message(stamp, EVIL, rotation.as_quat()), stamp)
+    return directory
+
+
+def test_strings_of_a_recording_cannot_become_markup(tmp_path):
+    topic = f"/reference/{EVIL}"
+    out = tmp_path / "report.html"
+    write_orientation_report(evil_recording(tmp_path / "b<i>ag", topic), tmp_path / "b<i>ag", out)
+    page = Page(out.read_text())
+    assert not [tag for tag, attributes in page.tags if tag in ("img", "i", "iframe")]
+    assert not [a for _, attributes in page.tags for a in attributes if a.startswith("on")]
+    assert len([t for t, _ in page.tags if t == "script"]) == 2 + len(page.figures)
+    assert EVIL in page.text and "b<i>ag" in page.text  # shown as what it is
+    # plotly reads tags in names: there they arrive as entities.
+    names = [trace.get("name", "") for figure in page.figures for trace in figure["data"]]
+    assert any("alert" in name for name in names)
+    assert not [name for name in names if "<" in name]
+
+
+def test_a_report_needs_nothing_from_outside(tmp_path):
+    out = tmp_path / "sub" / "report.html"
+    write_report(out, "title", [Section("One", (Text("text"), Figure(time_figure([
+        Panel("y in m", (Line("a", np.arange(3.0), np.arange(3.0), "#000000"),))])),))])
+    page = Page(out.read_text())
+    assert [link for link in page.links if not link.startswith("#")] == []
+    assert [t for t, _ in page.tags if t in ("link", "iframe", "object")] == []
+    assert "Plotly.newPlot" in out.read_text() and out.stat().st_size > 1e6
+
+
+def test_all_blocks_are_shown_and_columns_of_numbers_set_to_the_right():
+    text = render_report("T", [Section("S", (
+        Numbers((Number("RMSE", "1.5°", "moving"),)), Notes(("careful",)),
+        Table(("name", "value"), (("a", "1.25"), ("b", "–"))),))], "below")
+    page = Page(text)
+    for word in ("T", "below", "RMSE", "1.5°", "moving", "careful", "1.25"):
+        assert word in page.text
+    assert text.count('<td class="number">') == 2 and text.count('<th class="number">') == 1
+
+
+def test_a_report_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ImuFusionError, match="cannot be written"):
+        write_report(tmp_path / "file" / "report.html", "t", [])
+
+
+def test_the_report_of_a_real_recording_is_complete_and_bounded(tmp_path):
+    """Without estimates it is about the recording; the flight's autopilot is named as what it is."""
+    out = tmp_path / "report.html"
+    write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    page = Page(out.read_text())
+    assert "holds no estimates" in page.text and "/onboard_ekf/pose" in page.text
+    assert "13656" in page.text and "136.55" in page.text and "214 gaps" in page.text
+    headings = re.findall(r"<h2>(.*?)</h2>", out.read_text())
+    assert headings == ["Summary", "The recording", "Angular rates and specific force"]
+    assert out.stat().st_size < 8e6
+
+
+def test_hours_of_data_give_a_page_of_bounded_size():
+    n = 2_000_000
+    time = np.arange(n) * 0.0035
+    lines = tuple(Line(f"s{i}", time, np.sin(time * (i + 1)), "#000000") for i in range(3))
+    text = Figure(time_figure([Panel("y", lines)] * 3)).render()
+    # 9 lines x 3000 points x 2 x float32 in base64 are 290 kB; plotly's escaping can double it.
+    assert len(text) < 600_000
+
+
+def test_time_axes_are_one_and_all_panels_are_labelled():
+    line = Line("a", np.arange(5.0), np.arange(5.0), "#123456")
+    figure = time_figure([Panel("u in V", (line,)), Panel("i in A", (line,))], [(1.0, 2.0)], "on")
+    assert figure.layout.xaxis.matches == figure.layout.xaxis2.matches == "x"
+    labels = {a.text for a in figure.layout.annotations}
+    assert labels == {"u in V", "i in A"}
+    assert "time" in figure.layout.xaxis2.title.text
+    # One legend entry per name, however many panels it is in.
+    assert [t.name for t in figure.data if t.showlegend is not False] == ["a", "on"]
+
+
+def test_euler_angles_and_their_standard_deviations():
+    """Hand-worked: yaw 90 deg from east looks north; sd against a numerical derivative."""
+    quat = Rotation.from_euler("ZYX", [90, 20, -10], degrees=True).as_quat()[None]
+    angles, _ = euler_zyx(quat)
+    np.testing.assert_allclose(np.degrees(angles), [[-10, 20, 90]], atol=1e-12)
+    rng = np.random.default_rng(1)
+    rotation = Rotation.from_euler("ZYX", rng.uniform(-1.2, 1.2, (20, 3)))
+    square = rng.normal(size=(20, 3, 3))
+    cov = square @ square.transpose(0, 2, 1) * 1e-6
+    _, sd = euler_zyx(rotation.as_quat(), cov)
+    step = 1e-6
+    jacobian = np.stack([
+        (euler_zyx((rotation * Rotation.from_rotvec(step * axis)).as_quat())[0]
+         - euler_zyx((rotation * Rotation.from_rotvec(-step * axis)).as_quat())[0]) / (2 * step)
+        for axis in np.eye(3)], axis=2)
+    expected = np.sqrt(np.einsum("nij,njk,nik->ni", jacobian, cov, jacobian))
+    np.testing.assert_allclose(sd, expected, rtol=1e-6)
+    assert np.isnan(euler_zyx(quat, np.zeros((1, 3, 3)))[1]).all()
+
+
+def test_stretches_and_wraps():
+    mask = np.array([True, True, False, True])
+    assert intervals(np.arange(4.0), mask) == [(0.0, 2.0), (3.0, 3.0)]
+    assert intervals(np.arange(2.0), np.zeros(2, bool)) == []
+    np.testing.assert_array_equal(np.isnan(break_wraps([170, 179, -179, -170])),
+                                  [False, False, True, False])
