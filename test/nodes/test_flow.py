@@ -1,11 +1,12 @@
 """The protocol of nodes/flow.py between nodes of this process."""
 
 import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64
 
 from imu_fusion.nodes.flow import sink as flow_sink
 from imu_fusion.nodes.flow import source as flow_source
-from imu_fusion.nodes.flow import END, NEXT, WINDOW, FlowSink, FlowSource, Relay
+from imu_fusion.nodes.flow import END, NEXT, WINDOW, FlowSink, FlowSource, Relay, sensor_qos
 
 
 class Sender:
@@ -32,18 +33,18 @@ class Sender:
 
 
 class Receiver:
-    def __init__(self, graph, name="receiver", topic="/numbers", **options):
+    def __init__(self, graph, name="receiver", topic="/numbers", qos=None, **options):
         self.values, self.ended, self.begun = [], [], 0
         self.node = graph.node(name)
         self.sink = FlowSink(self.node, on_begin=self._begin,
                              on_end=lambda session: self.ended.append(session.event), **options)
-        self.inbox = self.sink.subscribe(Int64, topic, self._store)
+        self.inbox = self.sink.subscribe(Int64, topic, self._store, qos)
 
     def _begin(self, session):
         self.begun += 1
 
     def _store(self, cdr, info):
-        self.values.append(int.from_bytes(cdr[4:12], "little"))
+        self.values.append(int.from_bytes(cdr[4:12], "little", signed=True))
 
 
 class Doubler:
@@ -299,3 +300,30 @@ def test_sink_known_by_hearsay_only_is_given_up_after_a_while(graph, monkeypatch
     graph.until(lambda: "/ghost" in doubler.relay.source.waiting_for())
     graph.until(lambda: receiver.ended)
     assert len(receiver.values) == 201
+
+
+def test_best_effort_sink_listens_reliably_during_a_session_and_only_then(graph):
+    """A driver that offers best effort is heard before and after; a replay loses nothing."""
+    receiver = Receiver(graph, qos=sensor_qos())
+    driver = graph.node("driver").create_publisher(
+        Int64, "/numbers", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Int64(data=-1))
+    graph.until(lambda: receiver.values == [-1])
+    sender = Sender(graph, wait_for=["receiver"])
+    sender.session(20_000)
+    graph.until(lambda: receiver.ended and sender.source.session is None)
+    assert receiver.values == [-1, *range(20_000)]
+    assert receiver.inbox.lost == receiver.inbox.missed == 0
+    graph.until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Int64(data=-2))
+    graph.until(lambda: receiver.values[-1] == -2)
+
+
+def test_best_effort_sink_hears_a_loop_without_gaps(graph):
+    receiver = Receiver(graph, qos=sensor_qos())
+    sender = Sender(graph, wait_for=["receiver"])
+    for event in (NEXT, NEXT, END):
+        sender.session(300, event=event)
+        graph.until(lambda: sender.source.session is None)
+    assert receiver.values == 3 * list(range(300)) and receiver.ended == [NEXT, NEXT, END]

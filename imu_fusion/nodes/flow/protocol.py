@@ -25,6 +25,11 @@ def reliable_qos(depth=DEPTH, durability=DurabilityPolicy.VOLATILE):
                       reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
+def is_reliable(qos):
+    """Whether a QoS profile asks for (or offers) repeats of what was lost."""
+    return qos.reliability == ReliabilityPolicy.RELIABLE
+
+
 def sensor_qos():
     """The QoS of live inputs: best effort takes any publisher; deep, for bursts."""
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH,

@@ -7,7 +7,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.nodes.flow.protocol import (
     ACK, ACK_EVERY, ACK_QOS, ACK_TOPIC, BEGIN, COMPANY, DONE, NEXT, STATUS_HEARD, STATUS_TOPIC,
-    full_name, reliable_qos, status_message, steady_timer, subscribe_raw)
+    full_name, is_reliable, reliable_qos, status_message, steady_timer, subscribe_raw)
 
 PATIENCE = 5.0  # s of silence after which the last messages of an ended session count as lost
 
@@ -31,9 +31,12 @@ class Session:
 class Inbox:
     """What a sink counts of one topic."""
 
-    def __init__(self, topic, callback):
+    def __init__(self, topic, msg_type, callback, qos):
         self.topic = topic
+        self.msg_type = msg_type
         self.callback = callback
+        self.qos = qos  # outside sessions
+        self.subscription = None
         self.session = None
         self.last = None  # sequence number of the last message
         self.received = 0
@@ -77,14 +80,17 @@ class FlowSink:
         steady_timer(node, 0.5, self._watch)
 
     def subscribe(self, msg_type, topic, callback, qos=None):
-        """Subscribe to CDR bytes: ``callback(cdr, info)``; returns the :class:`Inbox`."""
+        """Subscribe to CDR bytes: ``callback(cdr, info)``; returns the :class:`Inbox`.
+
+        A best-effort subscription hears any live publisher. During a session it is
+        exchanged for a reliable one, so that nothing gets lost.
+        """
         topic = self._node.resolve_topic_name(topic)
-        inbox = self.inboxes[topic] = Inbox(topic, callback)
+        inbox = self.inboxes[topic] = Inbox(topic, msg_type, callback, qos or reliable_qos())
+        self._listen(inbox, inbox.qos)
         for session in self.sessions.values():
             if topic in session.topics:
                 self._enter(inbox, session)
-        subscribe_raw(self._node, msg_type, topic,
-                      lambda cdr, info: self._on_data(inbox, cdr, info), qos or reliable_qos())
         return inbox
 
     def release(self):
@@ -121,7 +127,16 @@ class FlowSink:
         self._ack.publish(status_message(self._name, session.id, event, {
             inbox.topic: f"{inbox.last} {inbox.lost}" for inbox in taken}))
 
+    def _listen(self, inbox, qos):
+        if inbox.subscription is not None:
+            self._node.destroy_subscription(inbox.subscription)
+        inbox.subscription = subscribe_raw(
+            self._node, inbox.msg_type, inbox.topic,
+            lambda cdr, info: self._on_data(inbox, cdr, info), qos)
+
     def _enter(self, inbox, session):
+        if not is_reliable(inbox.subscription.qos_profile):
+            self._listen(inbox, reliable_qos(durability=inbox.qos.durability))
         # A sink that joined late has heard messages of this session already.
         heard = inbox.session is None and inbox.received and inbox.last is not None
         if not heard or inbox.last < session.start[inbox.topic]:
@@ -238,6 +253,11 @@ class FlowSink:
     def _watch(self):
         """Find sessions that cannot end: their source is gone, or their tail was lost."""
         self.release()
+        for inbox in self.inboxes.values():
+            session = inbox.session
+            if session is not None and not session.is_open and session.event != NEXT and (
+                    is_reliable(inbox.subscription.qos_profile) != is_reliable(inbox.qos)):
+                self._listen(inbox, inbox.qos)
         if not self.sessions:
             return
         sources = {full_name(i) for i in self._node.get_publishers_info_by_topic(STATUS_TOPIC)}

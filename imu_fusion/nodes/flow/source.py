@@ -10,7 +10,7 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 from imu_fusion.nodes.flow.protocol import (
     ACK_EVERY, ACK_QOS, ACK_TOPIC, BEGIN, COMPANY, DONE, END, STATUS_OFFERED, STATUS_TOPIC,
-    WINDOW, full_name, reliable_qos, status_message, steady_timer, type_name)
+    WINDOW, full_name, is_reliable, reliable_qos, status_message, steady_timer, type_name)
 
 HEARSAY = 20.0  # s to discover a sink that another node knows; DDS forgets a dead one in 20 s
 _UNBOUNDED = float("inf")
@@ -248,13 +248,14 @@ class FlowSource:
         return bool(new)
 
     def _is_settled(self):
-        """All have answered, and the subscriptions they speak of have been matched."""
+        """All have answered, and the subscriptions they speak of are reliable and matched."""
         if not all(c.answered for c in self._consumers.values()):
             return False
         for topic, publisher in self._publishers.items():
             infos = self._node.get_subscriptions_info_by_topic(topic)
-            names = {full_name(i) for i in infos}
-            if any(topic in c.acked and n not in names for n, c in self._consumers.items()):
+            listening = {full_name(i): is_reliable(i.qos_profile) for i in infos}
+            if not all(listening.get(name) for name, c in self._consumers.items()
+                       if topic in c.acked):
                 return False
             compatible = sum(
                 qos_check_compatible(publisher.qos, i.qos_profile)[0] != QoSCompatibility.ERROR
