@@ -51,6 +51,6 @@ setup(
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
     ]},
-    package_data={"imu_fusion.report": ["*.css", "*.js"]},
+    package_data={"imu_fusion.report": ["*.css", "*.js"], "imu_fusion.nodes.flow": ["*.xml"]},
     zip_safe=False,
 )

@@ -1,8 +1,10 @@
 """What all nodes share: parameters from dataclasses, diagnostics, start and orderly end."""
 
 import importlib
+import os
 import signal
 import sys
+from pathlib import Path
 
 import rclpy
 import rclpy.node
@@ -177,6 +179,7 @@ def run_node(node_class, args=None):
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
+        use_fast_heartbeats()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         _run(node_class, signals)
         return 0
@@ -190,6 +193,13 @@ def run_node(node_class, args=None):
         rclpy.try_shutdown()
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def use_fast_heartbeats():
+    """Let Fast DDS notice lost messages soon, unless the user has profiles of their own."""
+    if not {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"} & os.environ.keys():
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(
+            Path(__file__).parent / "flow" / "fastdds.xml")
 
 
 def _run(node_class, signals):
