@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_fusion.errors import MessageError
-from imu_fusion.messages.convert import LOGS, read_log
+from imu_fusion.messages.convert import SAMPLE_TYPES, read_log
 from imu_fusion.messages.layouts import NANOSECONDS
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 
@@ -76,7 +76,7 @@ def inspect_topics(reader):
     """
     reports = []
     for name, info in sorted(reader.topics.items()):
-        if info.msgtype in LOGS and info.count:
+        if info.msgtype in SAMPLE_TYPES and info.count:
             try:
                 report = inspect_log(name, info.msgtype, read_log(reader, name))
             except MessageError as error:
