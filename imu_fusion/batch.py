@@ -25,14 +25,14 @@ from imu_fusion.samples.guard import guard_log
 class Stage:
     """One estimator of the batch path.
 
-    ``run(params, logs, report)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
-    report; ``logs`` maps a topic to (log, epochs) of the samples fit for use, without optional
+    ``run(logs, report, *params)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
+    report; ``params`` are objects of the classes of that name; ``logs`` maps a topic to (log, epochs) of the samples fit for use, without optional
     topics that the recording lacks. ``findings(logs)`` lists in words what looks wrong with
     whole logs as recorded. ``node_params`` are those of the node alone: read, not used.
     """
 
     node: str
-    params: type
+    params: tuple
     node_params: tuple
     required: dict
     optional: dict
@@ -50,7 +50,7 @@ class StageReport:
     """
 
     node: str
-    params: object
+    params: list
     used: dict = field(default_factory=dict)
     refused: dict = field(default_factory=dict)
     written: Counter = field(default_factory=Counter)
@@ -66,11 +66,12 @@ def _types(inputs, topics):
 def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
-        Stage("orientation_estimator", OrientationParams, (EstimatorNodeParams,),
+        Stage("orientation_estimator",
+              (OrientationParams, orientation.OrientationOutputParams), (EstimatorNodeParams,),
               required=_types(orientation.INPUTS, [orientation.IMU_TOPIC]),
-              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC]),
+              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC, orientation.FIX_TOPIC]),
               outputs=orientation.OUTPUTS, run=orientation.run, findings=orientation.findings),
-        Stage("smoother", smoothing.SmoothingParams, (smoothing.SmootherNodeParams,),
+        Stage("smoother", (smoothing.SmoothingParams,), (smoothing.SmootherNodeParams,),
               required=_types(smoothing.INPUTS, smoothing.REQUIRED),
               optional=_types(smoothing.INPUTS, [smoothing.MAG_TOPIC, smoothing.VELOCITY_TOPIC]),
               outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings),
@@ -104,8 +105,8 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
     with open_bag(bag) as reader:
         chosen, reports = [], []
         for stage in known.values():
-            params, *_ = parameters_for([stage.params, *stage.node_params], stage.node, params_file)
-            report = StageReport(stage.node, params)
+            params = parameters_for(stage.params + stage.node_params, stage.node, params_file)
+            report = StageReport(stage.node, params[:len(stage.params)])
             reports.append(report)
             if stage.node in without:
                 report.skipped = "switched off"
@@ -138,7 +139,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
                 if guard.refused():
                     report.refused[topic] = guard.refused()
             warnings += stage.findings({topic: logs[name][0] for topic, name in names.items()})
-            for topic, stamp, cdr in stage.run(report.params, inputs, report):
+            for topic, stamp, cdr in stage.run(inputs, report, *report.params):
                 writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
                 report.written[topic] += 1
             if report.summary:
