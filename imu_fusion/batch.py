@@ -13,8 +13,9 @@ from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages import orientation_stream as orientation
 from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
-from imu_fusion.messages.convert import LOGS
+from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.layouts import IMU, MAG
+from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameter_file import parameters_for
 from imu_fusion.samples.guard import guard_log
 
@@ -31,6 +32,7 @@ class Stage:
 
     node: str
     params: type
+    node_params: tuple
     required: dict
     optional: dict
     outputs: dict
@@ -53,7 +55,7 @@ class StageReport:
 def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
-        Stage("orientation_estimator", OrientationParams,
+        Stage("orientation_estimator", OrientationParams, (EstimatorNodeParams,),
               required={orientation.IMU_TOPIC: IMU.msgtype},
               optional={orientation.MAG_TOPIC: MAG.msgtype},
               outputs=orientation.OUTPUTS,
@@ -89,7 +91,8 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
     with open_bag(bag) as reader:
         chosen, reports = [], []
         for stage in known.values():
-            report = StageReport(stage.node, parameters_for(stage.params, stage.node, params_file))
+            params, *_ = parameters_for([stage.params, *stage.node_params], stage.node, params_file)
+            report = StageReport(stage.node, params)
             reports.append(report)
             if stage.node in without:
                 report.skipped = "switched off"
@@ -133,7 +136,8 @@ def _read(reader, names):
     raw = {name: [] for name in names}
     for topic, _, _, cdr in reader.messages(names):
         raw[topic].append(cdr)
-    logs = {name: LOGS[reader.topics[name].msgtype](messages) for name, messages in raw.items()}
+    logs = {name: SAMPLE_TYPES[reader.topics[name].msgtype].read(messages)
+            for name, messages in raw.items()}
     return {name: (log, *guard_log(log)) for name, log in logs.items()}
 
 

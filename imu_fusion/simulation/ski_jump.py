@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.geometry.gravity import gravity_world, normal_gravity
+from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
 from imu_fusion.parameters import Parameters, param
 from imu_fusion.surfaces.hill import Hill
 
@@ -219,6 +219,13 @@ class SkiJump:
         return Motion(t, *to_world, (body * mount).as_quat(), mount.inv().apply(omega_body))
 
     def specific_force(self, motion):
-        """Specific force (n, 3) in sensor axes, m/s^2."""
+        """Specific force (n, 3) in sensor axes, m/s^2, on the turning Earth."""
         g = np.array([gravity_world(p, self.gravity) for p in motion.position_world])
-        return Rotation.from_quat(motion.quat_world_imu).inv().apply(motion.acc_world - g)
+        spin = earth_rate_world(self.hill.origin.latitude_deg)
+        force = motion.acc_world - g + 2.0 * np.cross(spin, motion.vel_world)
+        return Rotation.from_quat(motion.quat_world_imu).inv().apply(force)
+
+    def rate(self, motion):
+        """What an ideal gyroscope reads (n, 3), rad/s: the Earth's rotation included."""
+        spin = earth_rate_world(self.hill.origin.latitude_deg)
+        return motion.omega_imu + Rotation.from_quat(motion.quat_world_imu).inv().apply(spin)
