@@ -4,6 +4,7 @@ Runs the same guards, estimators and message encoders as the nodes. For the same
 recording and parameters the estimates are those of the nodes, bit for bit.
 """
 
+import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -13,9 +14,9 @@ from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages import acceleration_field_stream as field_stream
 from imu_fusion.messages import orientation_stream as orientation
+from imu_fusion.messages import smoothing
 from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
 from imu_fusion.messages.convert import SAMPLE_TYPES
-from imu_fusion.messages.layouts import IMU, MAG
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameter_file import node_values, parameters_for
 from imu_fusion.samples.guard import guard_log
@@ -25,11 +26,12 @@ from imu_fusion.samples.guard import guard_log
 class Stage:
     """One estimator of the batch path.
 
-    ``findings(logs)`` lists in words what looks wrong with whole logs as recorded.
-    ``run(params, logs)`` yields (topic, stamp, cdr) of the ``outputs``; ``logs`` maps a
-    topic to (log, epochs) of the samples fit for use, None for an optional topic
-    that the recording lacks. ``kinds`` maps topics to the SampleType that reads them where
-    it is not the usual one of their type; ``unusable`` says why the stage cannot run.
+    ``run(params, logs, report)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
+    report; ``logs`` maps a topic to (log, epochs) of the samples fit for use, without optional
+    topics that the recording lacks. ``findings(logs)`` lists in words what looks wrong with
+    whole logs as recorded. ``node_params`` are those of the node alone: read, not used.
+    ``kinds`` maps topics to the SampleType that reads them where it is not the usual one of
+    their message type; ``unusable`` says why the stage cannot run.
     """
 
     node: str
@@ -51,10 +53,18 @@ class Stage:
         params, *_ = parameters_for([self.params, *self.node_params], self.node, params_file)
         return self, params
 
+    def kind(self, topic, info):
+        """The SampleType that reads a topic (bag.TopicInfo) of this stage."""
+        return self.kinds.get(topic) or SAMPLE_TYPES[info.msgtype]
+
 
 @dataclass
 class StageReport:
-    """What one stage did: samples taken and refused per topic, messages written."""
+    """What one stage did: samples taken and refused per topic, messages written.
+
+    ``skipped`` says why it did not run; ``summary`` is a line of text, ``results`` plain
+    numbers of what it found.
+    """
 
     node: str
     params: object
@@ -62,35 +72,40 @@ class StageReport:
     refused: dict = field(default_factory=dict)
     written: Counter = field(default_factory=Counter)
     skipped: str = ""
+    summary: str = ""
+    results: dict = field(default_factory=dict)
+
+
+def _types(inputs, topics):
+    return {topic: inputs[topic].layout.msgtype for topic in topics}
 
 
 def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
         Stage("orientation_estimator", OrientationParams, (EstimatorNodeParams,),
-              required={orientation.IMU_TOPIC: IMU.msgtype},
-              optional={orientation.MAG_TOPIC: MAG.msgtype},
-              outputs=orientation.OUTPUTS,
-              run=orientation.run,
-              findings=orientation.findings),
-        Stage(field_stream.NODE, field_stream.FieldConfiguration, (),
+              required=_types(orientation.INPUTS, [orientation.IMU_TOPIC]),
+              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC]),
+              outputs=orientation.OUTPUTS, run=orientation.run, findings=orientation.findings),
+        Stage("smoother", smoothing.SmoothingParams, (smoothing.SmootherNodeParams,),
+              required=_types(smoothing.INPUTS, smoothing.REQUIRED),
+              optional=_types(smoothing.INPUTS, [smoothing.MAG_TOPIC, smoothing.VELOCITY_TOPIC]),
+              outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings),
+        Stage(field_stream.NODE, field_stream.FieldConfiguration, (EstimatorNodeParams,),
               required={}, optional={}, outputs=field_stream.OUTPUTS, run=field_stream.run,
               findings=lambda logs: [], configure=_configure_field),
     )}
 
 
 def _configure_field(stage, params_file):
-    classes = field_stream.NODE_PARAMETERS
-    values = node_values(stage.node, params_file,
-                         {info.name for cls in classes for info in cls.infos()})
+    values = node_values(stage.node, params_file, field_stream.FieldConfiguration.names())
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
     config = field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
-    topics = {topic: kind.layout.msgtype for topic, kind in config.inputs.items()}
+    gyroscope = [field_stream.GYROSCOPE_TOPIC] * (config.gyroscope is not None)
     return replace(
-        stage, kinds=config.inputs,
-        required={t: m for t, m in topics.items() if t != field_stream.GYROSCOPE_TOPIC},
-        optional={t: m for t, m in topics.items() if t == field_stream.GYROSCOPE_TOPIC},
+        stage, kinds=config.inputs, optional=_types(config.inputs, gyroscope),
+        required=_types(config.inputs, [t for t in config.inputs if t not in gyroscope]),
         unusable="" if config.accelerometers else
         "no accelerometers described; set accelerometers.names in a parameter file"), config
 
@@ -144,7 +159,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         if not chosen:
             raise TopicError("nothing to do: " + "; ".join(
                 f"{r.node}: {r.skipped}" for r in reports))
-        kinds = {(name, stage.kinds.get(topic, SAMPLE_TYPES.get(reader.topics[name].msgtype)))
+        kinds = {(name, stage.kind(topic, reader.topics[name]))
                  for stage, _, names in chosen for topic, name in names.items()}
         wanted = sorted({name for name, _ in kinds})
         progress(f"reading {', '.join(wanted)} from {Path(bag).name}")
@@ -154,8 +169,8 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         for stage, report, names in chosen:
             inputs, recorded = {}, {}
             for topic, name in names.items():
-                kind = stage.kinds.get(topic, SAMPLE_TYPES.get(reader.topics[name].msgtype))
-                recorded[topic], log, epochs, guard = logs[name, kind]
+                recorded[topic], log, epochs, guard = logs[
+                    name, stage.kind(topic, reader.topics[name])]
                 inputs[topic] = (log, epochs)
                 report.used[topic] = len(log)
                 if guard.refused():
@@ -163,10 +178,14 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
             progress(f"{stage.node}: "
                      + ", ".join(f"{len(log)} {names[topic]}" for topic, log in recorded.items()))
             warnings += stage.findings(recorded)
-            for topic, stamp, cdr in stage.run(report.params, inputs):
+            for topic, stamp, cdr in stage.run(report.params, inputs, report):
                 writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
                 report.written[topic] += 1
-    return reports, warnings
+            if report.summary:
+                progress(f"{stage.node}: {report.summary}")
+        found = {report.node: report.results for report in reports if report.results}
+        (writer.directory / "results.json").write_text(json.dumps(found, indent=2))
+    return reports, list(dict.fromkeys(warnings))
 
 
 def _read(reader, names, kinds):

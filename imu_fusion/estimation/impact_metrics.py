@@ -23,17 +23,18 @@ J211_FROM_REP103 = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class ImpactParams(Parameters):
-    """When an event begins and how its signals are treated."""
+    """When an event begins and how its signals are treated; 0 as trigger finds none."""
 
-    trigger: float = param(98.0665, unit="m/s^2", low=0,
-                           doc="Linear acceleration at the point that begins an event.")
-    before: float = param(0.02, unit="s", low=0, doc="Kept before the trigger.")
-    duration: float = param(0.2, unit="s", low=1e-3, doc="Whole length of an event.")
-    linear_class: int | None = param(
+    impact__trigger: float = param(98.0665, unit="m/s^2", low=0,
+                           doc="Linear acceleration at the first point that begins an event; "
+                               "0: no events.")
+    impact__before: float = param(0.02, unit="s", low=0, doc="Kept before the trigger.")
+    impact__duration: float = param(0.2, unit="s", low=1e-3, doc="Whole length of an event.")
+    impact__linear_class: int | None = param(
         None, doc="Channel class (60, 180, 600 or 1000) of linear accelerations; unset: as is.")
-    angular_class: int | None = param(
+    impact__angular_class: int | None = param(
         None, doc="Channel class of angular rates and accelerations; unset: as is.")
-    axes: str = param("rep103", choices=("rep103", "j211"),
+    impact__axes: str = param("rep103", choices=("rep103", "j211"),
                       doc="Axes of the body: x forward with y left, z up, or y right, z down.")
 
 
@@ -171,13 +172,15 @@ def find_events(t, magnitude, params):
         magnitude: (n,) m/s^2.
         params: ImpactParams.
     """
-    above = magnitude >= params.trigger
+    if params.impact__trigger == 0:
+        return []
+    above = magnitude >= params.impact__trigger
     crossings = np.flatnonzero(above & ~np.r_[False, above[:-1]])
     events, end = [], -np.inf
     for k in crossings:
         if t[k] <= end:
             continue
-        begin, end = t[k] - params.before, t[k] - params.before + params.duration
+        begin, end = t[k] - params.impact__before, t[k] - params.impact__before + params.impact__duration
         events.append(slice(int(np.searchsorted(t, begin)),
                             int(np.searchsorted(t, end, side="right"))))
     return events
@@ -197,37 +200,40 @@ def measure_impacts(rows, points, gravity, params=ImpactParams()):
 
     Returns:
         List of dicts (one per event and point) of plain numbers and strings, for JSON or CSV.
+        An event with uneven stamps or of less than 3 ms has no metrics but says why:
+        ``refused``.
 
     Raises:
-        SampleError: too few rows, uneven stamps, or a rate too low for the channel class.
+        SampleError: a rate too low for the channel class.
     """
     if len(rows) < 3:
-        raise SampleError(f"impact metrics: {len(rows)} rows are too few")
+        return []
     t = (rows["stamp"] - rows["stamp"][0]) * 1e-9
     step = np.median(np.diff(t))
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     points = points if len(points) else np.zeros((1, 3))
-    to_j211 = J211_FROM_REP103 if params.axes == "rep103" else np.eye(3)
+    to_j211 = J211_FROM_REP103 if params.impact__axes == "rep103" else np.eye(3)
     acc = field_at(rows, points, gravity)[1] @ to_j211
     events = find_events(t, np.linalg.norm(acc[:, 0], axis=1), params)
     omega, alpha = rows["omega"] @ to_j211, rows["alpha"] @ to_j211
-    if params.linear_class is not None:
-        acc = channel_filter(acc, 1 / step, params.linear_class)
-    if params.angular_class is not None:
-        omega, alpha = (channel_filter(v, 1 / step, params.angular_class) for v in (omega, alpha))
+    if params.impact__linear_class is not None:
+        acc = channel_filter(acc, 1 / step, params.impact__linear_class)
+    if params.impact__angular_class is not None:
+        omega, alpha = (channel_filter(v, 1 / step, params.impact__angular_class) for v in (omega, alpha))
     results = []
     for number, event in enumerate(events):
-        # A record that ends in the middle, or has holes, gives no honest metric.
-        if np.any(np.abs(np.diff(t[event]) - step) > 0.1 * step):
-            raise SampleError(f"impact metrics: the stamps of the event at {t[event][0]:.3f} s are "
-                              "not even; smooth or resample the recording")
+        # Holes give no honest metric.
+        refused = ("stamps are not even" if np.any(
+            np.abs(np.diff(t[event]) - step) > 0.1 * step) else
+            "shorter than 3 ms" if t[event][-1] - t[event][0] < 0.003 else "")
         for k, point in enumerate(points):
             results.append({
                 "event": number, "begin_s": float(t[event][0]), "stamp": int(
                     rows["stamp"][event][0]), "point": [float(v) for v in point],
-                **_metrics(t[event], acc[event, k], omega[event], alpha[event]),
-                "linear_class": params.linear_class, "angular_class": params.angular_class,
-                "complete": bool(t[-1] - t[event][0] >= params.duration - 1.5 * step),
+                **({"refused": refused} if refused else
+                   _metrics(t[event], acc[event, k], omega[event], alpha[event])),
+                "linear_class": params.impact__linear_class, "angular_class": params.impact__angular_class,
+                "complete": bool(t[-1] - t[event][0] >= params.impact__duration - 1.5 * step),
                 "saturated_samples": int(np.sum(rows["flags"][event] & SATURATED > 0)),
                 "missing_samples": int(np.sum(rows["flags"][event] & (MISSING | GAP) > 0)),
                 "axes": "j211"})

@@ -9,6 +9,7 @@ from imu_fusion.estimation.acceleration_field import (AccelerationFieldEstimator
                                                       AccelerationFieldParams, GyroscopeParams,
                                                       parse_configuration)
 from imu_fusion.estimation.acceleration_field_rows import MISSING, SATURATED, field_at
+from imu_fusion.estimation.impact_metrics import ImpactParams, measure_impacts
 from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.messages.convert import SampleType, imu_message
 from imu_fusion.messages.layouts import ACCEL, IMU
@@ -60,6 +61,7 @@ class FieldConfiguration:
 
     field: AccelerationFieldParams
     matching: MatchingParams
+    impact: ImpactParams
     accelerometers: dict
     gyroscope: GyroscopeParams | None
 
@@ -71,11 +73,16 @@ class FieldConfiguration:
             ParameterError, LayoutError: with the name of what is wrong.
         """
         flat = flatten(values)
-        own = {info.name for info in MatchingParams.infos()}
-        matching = MatchingParams.from_mapping({k: v for k, v in flat.items() if k in own}, source)
-        return cls(matching=matching, **dict(zip(
-            ("field", "accelerometers", "gyroscope"), parse_configuration(
-                {k: v for k, v in flat.items() if k not in own}, source))))
+        matching, impact = (
+            c.from_mapping({i.name: flat.pop(i.name) for i in c.infos() if i.name in flat}, source)
+            for c in (MatchingParams, ImpactParams))
+        field, accelerometers, gyroscope = parse_configuration(flat, source)
+        return cls(field, matching, impact, accelerometers, gyroscope)
+
+    @staticmethod
+    def names():
+        """Parameter names, without those of single sensors."""
+        return {info.name for cls in NODE_PARAMETERS for info in cls.infos()}
 
     @property
     def inputs(self):
@@ -173,18 +180,22 @@ class AccelerationFieldStream(Stream):
                 self.emit(*message)
 
 
-def run(config, logs):
+def run(config, logs, report):
     """The messages that :class:`AccelerationFieldStream` emits for a session, from whole logs.
+
+    The metrics of impacts, where there are any, go into the report's results.
 
     Args:
         config: FieldConfiguration.
         logs: dict of input topic to (log, epochs) of guarded samples; a topic may lack.
+        report: batch.StageReport.
 
     Yields:
         (topic, stamp, cdr)
     """
     topics = [topic for topic in config.inputs if topic in logs]
     index = {topic: k for k, topic in enumerate(config.inputs)}
+    impacts = []
     samples = [logs[topic][0].flat() for topic in topics]
     epochs = [logs[topic][1] for topic in topics]
     for epoch in np.unique(np.concatenate(epochs)):
@@ -201,8 +212,18 @@ def run(config, logs):
         readings = np.array([r for _, r in matched])
         count = len(config.accelerometers)
         gyr = readings[:, count] if config.gyroscope is not None else None
-        yield from messages(config, estimator.run(
-            np.array([s for s, _ in matched], dtype=np.int64), readings[:, :count], gyr))
+        rows = estimator.run(np.array([s for s, _ in matched], dtype=np.int64),
+                             readings[:, :count], gyr)
+        impacts += _impacts(config, rows)
+        yield from messages(config, rows)
+    if impacts:
+        report.results["impacts"] = impacts
+    number = len({impact["stamp"] for impact in impacts})
+    report.summary = f"{number} impacts above {config.impact.impact__trigger:g} m/s^2"
 
 
-NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, MatchingParams)
+def _impacts(config, rows):
+    return measure_impacts(rows, config.field.points, config.field.gravity, config.impact)
+
+
+NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, MatchingParams, ImpactParams)

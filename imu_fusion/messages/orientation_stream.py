@@ -90,12 +90,13 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def run(params, logs):
+def run(params, logs, report):
     """The messages that :class:`OrientationStream` emits for a session, from whole logs.
 
     Args:
         params: OrientationParams.
         logs: dict of input topic to (log, epochs) of guarded samples.
+        report: gets the estimator's ``results``.
 
     Yields:
         (topic, stamp, cdr)
@@ -110,3 +111,4 @@ def run(params, logs):
         rows = [estimator.run(imu[imu_epochs == epoch], mag[mag_epochs == epoch]),
                 estimator.finish()]
         yield from writer.messages(np.concatenate(rows), imu.frame_id)
+    report.results = estimator.summary()

@@ -1,5 +1,6 @@
 """The acceleration field node: equal to batch, tolerant of faults, controllable."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,17 @@ def test_what_is_published_is_the_motion(graph, motion, tmp_path):
     assert np.allclose(field[1, 3:6], truth, atol=2e-3 * peak)
     assert field[1, 6] == pytest.approx(np.linalg.norm(truth), abs=2e-3 * peak)
     assert clouds[550].header.frame_id == "body"
+
+
+def test_batch_measures_impacts(motion, tmp_path):
+    bag = write(tmp_path / "bag", motion, faults=False)
+    file = params_file(tmp_path / "p.yaml", **{"impact.trigger": 20.0})
+    batch.process(bag, tmp_path / "out", file)
+    found = json.loads((tmp_path / "out" / "results.json").read_text())
+    impacts = found["acceleration_field_estimator"]["impacts"]
+    assert [i["point"][2] for i in impacts] == [0.75, 0.67]
+    truth = np.linalg.norm(motion.acceleration_body([0, 0, 0.75]), axis=1).max()
+    assert impacts[0]["peak_linear_acceleration"] == pytest.approx(truth, rel=2e-3)
 
 
 def test_live_rows_leave_when_complete(graph, motion):
