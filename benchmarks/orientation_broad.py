@@ -124,7 +124,8 @@ def main():
     rows = []
 
     def add(name, tuning, plain, delayed, share=""):
-        rows.append([name, tuning, *(" / ".join(f"{v:.2f}" for v in e.mean(axis=0))
+        rows.append([name, tuning, *("" if e is None
+                                     else " / ".join(f"{v:.2f}" for v in e.mean(axis=0))
                                      for e in (plain, delayed)),
                      " ".join(f"{v:.1f}" for v in delayed[:, 0]), share])
         print(rows[-1], flush=True)
@@ -158,12 +159,11 @@ def main():
         if "method" in changes:
             continue
         default = OrientationParams()
-        sets = [dict(zip(("velocity_walk", "mag_sd", "gyr_noise_density"), scales, strict=True))
-                for scales in itertools.product((0.5, 1.0, 2.0), repeat=3)]
-        errors = np.array([[mine(**changes, **d, **{
-            k: getattr(default, k) * v for k, v in s.items()})[0] for s in sets]
-            for d in ({}, delays)])
-        add(name, "leave one out", *map(leave_one_out, errors))
+        sets = [dict(zip(("velocity_walk", "mag_sd"), scales, strict=True))
+                for scales in itertools.product((0.5, 1.0, 2.0), repeat=2)]
+        tuned = leave_one_out(np.array([mine(**changes, **delays, **{
+            k: getattr(default, k) * v for k, v in s.items()})[0] for s in sets]))
+        add(name, "leave one out", None, tuned)
 
     names = " ".join(path.name[:2] for path in broad_trials())
     write_table("orientation_broad", [
