@@ -62,12 +62,14 @@ def descriptor(info):
 class Node(rclpy.node.Node):
     """Base of our nodes.
 
-    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses.
-    Unknown parameters, wrong types and values out of bounds raise ParameterError.
+    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses, and
+    ``OPEN_PREFIXES``: parameters below these need not be known, ``open_parameters`` holds them.
+    Other unknown parameters, wrong types and values out of bounds raise ParameterError.
     """
 
     NAME = ""
     PARAMETERS = ()
+    OPEN_PREFIXES = ()
 
     def __init__(self, **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
@@ -116,6 +118,10 @@ class Node(rclpy.node.Node):
                 given[name] = value.tolist() if hasattr(value, "tolist") else value
                 self.undeclare_parameter(name)
         known = {info.name: info for cls in self.PARAMETERS for info in cls.infos()}
+        self.open_parameters = {name: given.pop(name) for name in list(given)
+                                if name not in known and name.startswith(self.OPEN_PREFIXES)}
+        for name, value in self.open_parameters.items():
+            self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
