@@ -4,6 +4,7 @@ Runs the same guards, estimators and message encoders as the nodes. For the same
 recording and parameters the estimates are those of the nodes, bit for bit.
 """
 
+import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,9 +13,10 @@ from pathlib import Path
 from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages import orientation_stream as orientation
+from imu_fusion.messages import smoothing
 from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
-from imu_fusion.messages.convert import LOGS
-from imu_fusion.messages.layouts import IMU, MAG
+from imu_fusion.messages.convert import SAMPLE_TYPES
+from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameter_file import parameters_for
 from imu_fusion.samples.guard import guard_log
 
@@ -23,14 +25,15 @@ from imu_fusion.samples.guard import guard_log
 class Stage:
     """One estimator of the batch path.
 
-    ``findings(logs)`` lists in words what looks wrong with whole logs as recorded.
-    ``run(params, logs)`` yields (topic, stamp, cdr) of the ``outputs``; ``logs`` maps a
-    topic to (log, epochs) of the samples fit for use, None for an optional topic
-    that the recording lacks.
+    ``run(params, logs, report)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
+    report; ``logs`` maps a topic to (log, epochs) of the samples fit for use, without optional
+    topics that the recording lacks. ``findings(logs)`` lists in words what looks wrong with
+    whole logs as recorded. ``node_params`` are those of the node alone: read, not used.
     """
 
     node: str
     params: type
+    node_params: tuple
     required: dict
     optional: dict
     outputs: dict
@@ -40,7 +43,11 @@ class Stage:
 
 @dataclass
 class StageReport:
-    """What one stage did: samples taken and refused per topic, messages written."""
+    """What one stage did: samples taken and refused per topic, messages written.
+
+    ``skipped`` says why it did not run; ``summary`` is a line of text, ``results`` plain
+    numbers of what it found.
+    """
 
     node: str
     params: object
@@ -48,17 +55,25 @@ class StageReport:
     refused: dict = field(default_factory=dict)
     written: Counter = field(default_factory=Counter)
     skipped: str = ""
+    summary: str = ""
+    results: dict = field(default_factory=dict)
+
+
+def _types(inputs, topics):
+    return {topic: inputs[topic].layout.msgtype for topic in topics}
 
 
 def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
-        Stage("orientation_estimator", OrientationParams,
-              required={orientation.IMU_TOPIC: IMU.msgtype},
-              optional={orientation.MAG_TOPIC: MAG.msgtype},
-              outputs=orientation.OUTPUTS,
-              run=orientation.run,
-              findings=orientation.findings),
+        Stage("orientation_estimator", OrientationParams, (EstimatorNodeParams,),
+              required=_types(orientation.INPUTS, [orientation.IMU_TOPIC]),
+              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC]),
+              outputs=orientation.OUTPUTS, run=orientation.run, findings=orientation.findings),
+        Stage("smoother", smoothing.SmoothingParams, (smoothing.SmootherNodeParams,),
+              required=_types(smoothing.INPUTS, smoothing.REQUIRED),
+              optional=_types(smoothing.INPUTS, [smoothing.MAG_TOPIC, smoothing.VELOCITY_TOPIC]),
+              outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings),
     )}
 
 
@@ -89,7 +104,8 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
     with open_bag(bag) as reader:
         chosen, reports = [], []
         for stage in known.values():
-            report = StageReport(stage.node, parameters_for(stage.params, stage.node, params_file))
+            params, *_ = parameters_for([stage.params, *stage.node_params], stage.node, params_file)
+            report = StageReport(stage.node, params)
             reports.append(report)
             if stage.node in without:
                 report.skipped = "switched off"
@@ -122,9 +138,13 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
                 if guard.refused():
                     report.refused[topic] = guard.refused()
             warnings += stage.findings({topic: logs[name][0] for topic, name in names.items()})
-            for topic, stamp, cdr in stage.run(report.params, inputs):
+            for topic, stamp, cdr in stage.run(report.params, inputs, report):
                 writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
                 report.written[topic] += 1
+            if report.summary:
+                progress(f"{stage.node}: {report.summary}")
+        found = {report.node: report.results for report in reports if report.results}
+        (writer.directory / "results.json").write_text(json.dumps(found, indent=2))
     return reports, warnings
 
 
@@ -133,7 +153,8 @@ def _read(reader, names):
     raw = {name: [] for name in names}
     for topic, _, _, cdr in reader.messages(names):
         raw[topic].append(cdr)
-    logs = {name: LOGS[reader.topics[name].msgtype](messages) for name, messages in raw.items()}
+    logs = {name: SAMPLE_TYPES[reader.topics[name].msgtype].read(messages)
+            for name, messages in raw.items()}
     return {name: (log, *guard_log(log)) for name, log in logs.items()}
 
 

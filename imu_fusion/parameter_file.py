@@ -48,29 +48,36 @@ def _walk(path, content, prefix=""):
             yield from _walk(path, body, f"{prefix}{key}/")
 
 
-def parameters_for(cls, node, path=None, **options):
+def parameters_for(classes, node, path=None, ignore=()):
     """The parameters of one node from a file, or its defaults without one.
 
     Args:
-        cls: a :class:`~imu_fusion.parameters.Parameters` class.
+        classes: the :class:`~imu_fusion.parameters.Parameters` classes of the node.
         node: node name; ``/**`` in the file applies to every node, with the names known to it.
         path: the file, or None.
-        options: passed to ``cls.from_mapping``.
+        ignore: names (or prefixes ending in a dot) that are read by somebody else.
+
+    Returns:
+        list of one object per class.
 
     Raises:
-        ParameterError: as ``cls.from_mapping``, naming the file.
+        ParameterError: unknown name, wrong type, value out of bounds; names the file.
     """
     if path is None:
-        return cls()
+        return [cls() for cls in classes]
     nodes = load(path)
-    known = {info.name for info in cls.infos()}
+    known = {info.name for cls in classes for info in cls.infos()}
     values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
     values.update(flatten(nodes.get(node, {})))
     values.pop("use_sim_time", None)
-    for info in cls.infos():
-        if info.path and values.get(info.name):
-            values[info.name] = resolve(values[info.name], path)
-    return cls.from_mapping(values, source=str(path), **options)
+    result = []
+    for cls in classes:
+        own = {info.name for info in cls.infos()}
+        for info in cls.infos():
+            if info.path and values.get(info.name):
+                values[info.name] = resolve(values[info.name], path)
+        result.append(cls.from_mapping(values, source=str(path), ignore=(*ignore, *(known - own))))
+    return result
 
 
 def resolve(value, parameter_file):

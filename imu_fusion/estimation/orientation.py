@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.errors import SampleError
+from imu_fusion.errors import EstimationError, ParameterError, SampleError
+from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_alignment import align
+from imu_fusion.estimation.orientation_smoother import smooth
 from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
 from imu_fusion.parameters import Parameters, param
 
@@ -30,8 +32,11 @@ _CHUNK = 256
 class OrientationParams(Parameters):
     """What the orientation estimator can be told."""
 
-    method: str = param("gyro_mag", choices=("gyro_mag",),
-                        doc="gyro_mag: Winkler 2025, gyroscope and magnetometer.")
+    method: str = param("fusion", choices=("fusion", "gyro_mag"),
+                        doc="fusion: error-state filter over all three sensors; gyro_mag: "
+                            "Winkler 2025, gyroscope and magnetometer.")
+    mode: str = param("causal", choices=("causal", "smoothed"),
+                      doc="smoothed: run() on a whole recording also looks ahead (fusion only).")
     world_frame: str = param("enu", choices=("enu", "ned", "nwu"),
                              doc="World axes of the published orientation.")
     declination_deg: float | None = param(
@@ -45,11 +50,12 @@ class OrientationParams(Parameters):
                                      doc="Gyroscope noise.")
     gyr_bias_sd: float = param(0.01, unit="rad/s", low=0, high=1,
                                doc="Standard deviation of a bias that no rest has shown.")
-    gyr_bias_walk: float = param(1e-5, unit="rad/s/sqrt(s)", low=0, high=1,
+    gyr_bias_walk: float = param(2e-5, unit="rad/s/sqrt(s)", low=0, high=1,
                                  doc="Random walk of the gyroscope bias.")
     gyr_range: tuple[float, ...] | None = param(
         None, unit="rad/s", low=1e-3, length=(1, 3),
-        doc="Largest rate the gyroscope reports, one value or one per axis; unset: none.")
+        doc="Largest rate the gyroscope reports, one value or one per axis; unset: found "
+            "from flat tops by fusion.")
     acc_noise_density: float = param(2e-3, unit="m/s^2/sqrt(Hz)", low=1e-9, high=10,
                                      doc="Accelerometer noise.")
     acc_bias_sd: float = param(0.05, unit="m/s^2", low=0, high=10,
@@ -63,18 +69,66 @@ class OrientationParams(Parameters):
         doc="Soft iron, row by row; multiplies the sample after the offset.")
     mag_reliability: float = param(5.0, low=0, doc="p of the weight (10) of Winkler 2025.")
     field_sd: float = param(0.05, low=0, high=1,
-                            doc="Wander of the local field, relative to its norm.")
-    field_time: float = param(20.0, unit="s", low=1e-3, doc="Time constant of that wander.")
+                            doc="gyro_mag: wander of the local field, relative to its norm.")
+    field_time: float = param(20.0, unit="s", low=1e-3,
+                              doc="gyro_mag: time constant of that wander.")
     gyr_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
-                             doc="How late a rate is stamped.")
-    mag_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
-                             doc="How late a magnetometer sample is stamped.")
+                             doc="How late rates and specific forces are stamped.")
+    mag_delay: float | None = param(
+        None, unit="s", low=-0.1, high=0.1,
+        doc="How late a magnetometer sample is stamped; unset: estimated by fusion, "
+            "that of the gyroscope in gyro_mag.")
+    mag_delay_sd: float = param(0.01, unit="s", low=0, high=0.1,
+                                doc="Standard deviation of a magnetometer delay that is not given.")
+    block: float = param(0.02, unit="s", low=1e-3, high=1, doc="Time between corrections.")
+    gyr_scale_sd: float = param(0.003, low=0, high=0.2,
+                                doc="Standard deviation of gyroscope scale and misalignment.")
+    estimate_bias: bool = param(True, doc="Whether gyroscope bias and scale are estimated.",
+                                read_only=False)
+    velocity_walk: float = param(0.1, unit="m/s^2/sqrt(Hz)", low=0,
+                                 doc="What the specific force does not tell of the motion.")
+    velocity_sd: float = param(0.6, unit="m/s", low=1e-3,
+                               doc="Velocity of the motion, per axis, about its mean.")
+    velocity_time: float = param(0.3, unit="s", low=1e-3, doc="Its correlation time.")
+    position_sd: float = param(0.6, unit="m", low=1e-3,
+                               doc="Extent of the motion, per axis, about its mean.")
+    position_time: float = param(0.3, unit="s", low=1e-3, doc="Its correlation time.")
+    local_field_sd: float = param(0.01, low=0, high=1,
+                                  doc="Local deviation of the field, relative to its norm.")
+    local_field_time: float = param(0.3, unit="s", low=1e-3,
+                                    doc="Time in which a moving sensor leaves it behind.")
+    field_walk: float = param(1e-4, unit="1/sqrt(s)", low=0, high=1,
+                              doc="Drift of the field, relative to its norm.")
+    mag_sd: float = param(0.03, low=1e-4, high=1,
+                          doc="Disturbance of the field in motion, relative to its norm.")
+    norm_deviation_factor: float = param(
+        3.0, low=0, doc="That disturbance grows by this times the deviation of the norm.")
+    mag_offset_sd: float = param(0.03, low=0, high=1,
+                                 doc="Hard iron left over by calibration, relative to the norm.")
+    mag_matrix_sd: float = param(0.02, low=0, high=1,
+                                 doc="Soft iron and misalignment left over by calibration.")
+    rest_rate: float = param(0.04, unit="rad/s", low=0,
+                             doc="Largest deviation of the rate from its mean at rest.")
+    rest_force: float = param(0.5, unit="m/s^2", low=0,
+                              doc="Largest deviation of the specific force from its mean at rest.")
+    rest_time: float = param(0.5, unit="s", low=0, doc="Time after which rest counts.")
+    rest_rate_sd: float = param(0.006, unit="rad/s", low=1e-6,
+                                doc="Rate of a hand or table at rest.")
+    saturation_walk: float = param(20.0, unit="rad/s/sqrt(s)", low=0,
+                                   doc="Random walk of a rate beyond the gyroscope's limit.")
     max_mag_lag: float = param(0.1, unit="s", low=0, high=10,
                                doc="Magnetometer samples that arrive later are dropped.")
     max_gap: float = param(0.1, unit="s", low=1e-3,
                            doc="A longer step between Imu samples counts as a gap.")
     gap_rate_sd: float = param(1.0, unit="rad/s", low=0,
                                doc="Rate that may have gone unseen in a gap.")
+
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.mode == "smoothed" and self.method != "fusion":
+            raise ParameterError("parameter 'mode': 'smoothed' needs method 'fusion', "
+                                 f"not '{self.method}'")
 
 
 def _axes(value, default):
@@ -96,7 +150,7 @@ class OrientationEstimator:
 
     def __init__(self, params=OrientationParams()):
         self.params = params
-        self._kernel = gyro_mag
+        self._kernel = {"fusion": fusion, "gyro_mag": gyro_mag}[params.method]
         self._par = self._pack(params)
         self._sample = np.empty(6)
         self._mag = np.empty(3)
@@ -152,12 +206,20 @@ class OrientationEstimator:
         Args:
             imu: ImuLog. mag: MagLog or None.
 
+        In mode ``smoothed`` the log must be whole: nothing is carried over from or to
+        other calls.
+
         Returns:
             ORIENTATION_DTYPE array; call :meth:`finish` for what a log shorter than the
             alignment leaves behind.
+
+        Raises:
+            EstimationError: mode ``smoothed`` in the middle of a stream.
         """
         mag_stamps = np.empty(0, dtype=np.int64) if mag is None else mag.stamp
         mags = np.empty((0, 3)) if mag is None else mag.mag
+        if self.params.mode == "smoothed":
+            return self._run_smoothed(imu, mag_stamps, mags)
         parts = []
         i = j = 0
         while self._alignment is None and i < len(imu):
@@ -213,7 +275,7 @@ class OrientationEstimator:
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
             **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", bias)},
-            gyr_delay=self.params.gyr_delay, mag_delay=self.params.mag_delay)
+            gyr_delay=self.params.gyr_delay, mag_delay=self.params.gyr_delay + float(x[st.LAG]))
 
     def _step(self, stamp):
         if self._next == _CHUNK:
@@ -243,27 +305,50 @@ class OrientationEstimator:
             return self._chunk[:0]
         return self._start()
 
+    def _run_smoothed(self, imu, mag_stamps, mags):
+        if self._alignment is not None or self._waiting:
+            raise EstimationError("mode 'smoothed' needs the whole recording in one run(); "
+                                  "reset() first, or use mode 'causal'")
+        good = np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1)
+        if not good.any():
+            return self._chunk[:0]
+        origin = imu.stamp[np.argmax(good)]
+        end = origin + int(self.params.alignment_duration * 1e9)
+        first = good & (imu.stamp <= end)
+        first_mag = np.isfinite(mags).all(axis=1) & (mag_stamps <= end)
+        samples = np.hstack([imu.gyr, imu.acc])
+        self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
+        rows = np.zeros(len(imu), ORIENTATION_DTYPE)
+        after = mag_stamps >= origin
+        written = smooth(self._x, self._k, self._par, imu.stamp, samples, mag_stamps[after],
+                         mags[after], *_views(rows))
+        return rows[:written]
+
     def _start(self):
         """Align on the waiting samples and send them through the kernel."""
-        p, par = self.params, self._par
         imus = [(s, v) for s, v in self._waiting if len(v) == 6]
+        mags = [(s, v) for s, v in self._waiting if len(v) == 3]
+        self._waiting, self._waiting_imus = [], 0
         stamps = np.array([s for s, _ in imus], dtype=np.int64)
         samples = np.array([v for _, v in imus])
-        mags = [(s, v) for s, v in self._waiting if len(v) == 3]
         mag_stamps = np.array([s for s, _ in mags], dtype=np.int64)
         mag = np.array([v for _, v in mags]).reshape(-1, 3)
-        calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
-                      @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
-        a = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
-                  declination=math.radians(p.declination_deg or 0.0),
-                  yaw_offset=math.radians(p.yaw_offset_deg), gyr_density=p.gyr_noise_density,
-                  gyr_bias_sd=p.gyr_bias_sd, acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
-        self._alignment = a
-        self._kernel.initialise(self._x, self._k, par, a)
-        self._k[st.ALIGN_UNTIL] = stamps[-1]
-        self._waiting, self._waiting_imus = [], 0
+        self._align(stamps, samples, mag_stamps, mag)
         after = mag_stamps >= stamps[0]
         return self._run_kernel(stamps, samples, mag_stamps[after], mag[after])
+
+    def _align(self, stamps, samples, mag_stamps, mag):
+        p, par = self.params, self._par
+        calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
+                      @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
+        self._alignment = align(
+            stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
+            declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
+            gyr_density=p.gyr_noise_density, gyr_bias_sd=p.gyr_bias_sd,
+            acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
+        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyr_delay
+        self._kernel.initialise(self._x, self._k, par, self._alignment)
+        self._k[st.ALIGN_UNTIL] = stamps[-1]
 
     def _run_kernel(self, stamps, samples, mag_stamps, mags):
         rows = np.zeros(len(stamps), ORIENTATION_DTYPE)
@@ -274,7 +359,7 @@ class OrientationEstimator:
     def _pack(self, p):
         par = np.zeros(self._kernel.P_SIZE)
         par[st.P_GYR_DELAY] = p.gyr_delay
-        par[st.P_MAG_DELAY] = p.mag_delay
+        par[st.P_DECLINATION] = math.radians(p.declination_deg or 0.0)
         par[st.P_MAX_LAG] = p.max_mag_lag
         par[st.P_MAX_GAP] = p.max_gap
         par[st.P_GYR_DENSITY] = p.gyr_noise_density
@@ -284,7 +369,7 @@ class OrientationEstimator:
         par[st.P_RELIABILITY] = p.mag_reliability
         par[st.P_GAP_RATE_SD] = p.gap_rate_sd
         par[st.P_BIAS_WALK] = p.gyr_bias_walk
-        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.inf)
+        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.nan)
         par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
         par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset
         par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9] = p.mag_matrix

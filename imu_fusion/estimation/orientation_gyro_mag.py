@@ -14,12 +14,14 @@ from numba import njit
 
 from imu_fusion.estimation.orientation_state import (
     ALIGN_UNTIL, FIELD, FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING,
-    FLAG_SATURATED, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, IMU_REJECTED, IMU_USED, K_COMMON,
-    LAST_STAMP, MAG, MAG_COUNT, MAG_USED, P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_COMMON,
-    P_GAP_RATE_SD, P_GYR_DENSITY, P_MAG_SD, P_MAX_GAP, P_RANGE, P_RELIABILITY, Q, SATURATED,
-    STARTED, U, X_COMMON, is_finite3, push_mag, push_rotation, take_mags, write_row)
+    FLAG_SATURATED, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, K_COMMON, LAST_STAMP, MAG_USED,
+    P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_COMMON, P_GAP_RATE_SD, P_GYR_DENSITY,
+    P_MAG_SD, P_MAX_GAP, P_RANGE, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
+    TAKEN_WORDS, U, UNIFORM_VARIANCE, X_COMMON, is_newer, push_mag, push_rotation, take_mags,
+    write_row)
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix, right_jacobian, skew)
+    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
+    quat_to_matrix, right_jacobian, skew)
 
 COV = X_COMMON                 # (9, 9): attitude, bias, relative field
 N = 9
@@ -206,32 +208,29 @@ def step_imu(x, k, par, stamp, sample, row, row_int):
         1 if a row was written, 0 if the sample was refused (not finite, or not
         newer than the last).
     """
+    if not is_newer(k, stamp, sample):
+        return 0
     gyr = sample[:3].copy()
     acc = sample[3:6].copy()
-    if not is_finite3(gyr) or not is_finite3(acc) or (k[STARTED] and stamp <= k[LAST_STAMP]):
-        k[IMU_REJECTED] += 1
-        return 0
     cov = x[COV:COV + N * N].reshape(N, N)
     bias = x[GYR_BIAS:GYR_BIAS + 3]
     rate_next = gyr - bias
     flags = 0
     dt = 0.0
+    rate = rate_next
     if k[STARTED]:
         dt = (stamp - k[LAST_STAMP]) * 1e-9
         rate = x[GYR_LAST:GYR_LAST + 3] - bias
-    else:
-        rate = rate_next
     push_rotation(x, k, stamp, 0.5 * dt * (rate + rate_next))
     k[LAST_STAMP] = stamp
     k[STARTED] = 1
-    k[IMU_USED] += 1
     x[GYR_LAST:GYR_LAST + 3] = gyr
 
     gap_variance = 0.0
     if dt > par[P_MAX_GAP]:
         flags |= FLAG_GAP
         k[GAPS] += 1
-        gap_variance = (par[P_GAP_RATE_SD] * dt) ** 2
+        gap_variance = min((par[P_GAP_RATE_SD] * dt) ** 2, UNIFORM_VARIANCE)
     for i in range(3):
         if abs(gyr[i]) >= par[P_RANGE + i]:
             flags |= FLAG_SATURATED
@@ -239,10 +238,8 @@ def step_imu(x, k, par, stamp, sample, row, row_int):
         k[SATURATED] += 1
 
     # The step: gyroscope alone, or with the magnetometer samples that came.
-    for i in range(3):
-        x[MAG + i] = 0.0
-    k[MAG_COUNT] = 0
-    taken = take_mags(x, k, par)
+    samples = np.empty((PENDING_LENGTH, TAKEN_WORDS))
+    taken = take_mags(x, k, samples)
     b0 = math.sqrt(x[FIELD] ** 2 + x[FIELD + 1] ** 2 + x[FIELD + 2] ** 2)
     weight = 0.0
     reliability = np.nan
@@ -250,14 +247,16 @@ def step_imu(x, k, par, stamp, sample, row, row_int):
     field = np.zeros(3)
     unit_mag = np.zeros(3)
     quat = x[Q:Q + 4].copy()
+    if taken > 0:
+        mag[:] = 0.0
+        for i in range(taken):
+            mag += quat_rotate(samples[i, 6:10], samples[i, :3]) / taken
     if taken > 0 and k[HEADING_KNOWN]:
-        mag = x[MAG:MAG + 3] / taken
         norm = math.sqrt(mag[0] ** 2 + mag[1] ** 2 + mag[2] ** 2)
         reliability = math.exp(-(par[P_RELIABILITY] * (b0 - norm) / b0) ** 2)
         weight = reliability
         unit_mag = mag / b0
-        inverse = np.array([-quat[0], -quat[1], -quat[2], quat[3]])
-        field = quat_rotate(inverse, x[FIELD:FIELD + 3]) / b0
+        field = quat_rotate_inverse(quat, x[FIELD:FIELD + 3]) / b0
     gain = np.zeros((3, 3))
     phi = solve_step(rate, rate_next, dt, field, unit_mag, weight, gain)
     r = quat_to_matrix(quat_multiply(quat, quat_exp(0.5 * phi)))

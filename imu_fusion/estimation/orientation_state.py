@@ -43,8 +43,12 @@ FLAG_GAP = 16           # samples are missing before this one
 FLAG_ALIGNING = 32      # inside the interval from which the initial orientation was found
 FLAG_NO_HEADING = 64    # no magnetometer sample has fixed the heading yet
 
+UNIFORM_VARIANCE = math.pi ** 2 / 3.0   # rad^2, of an angle about which nothing is known
+
 ROW_WORDS = ORIENTATION_DTYPE.itemsize // 8
-_STAMP, _QUAT, _COV, _GYR, _COV_GYR, _ACC, _COV_ACC, _BIAS, _BIAS_SD, _MAG, _REL, _FLAGS = (
+# Offsets of the fields in words.
+(ROW_STAMP, ROW_QUAT, ROW_COV, ROW_GYR, ROW_COV_GYR, ROW_ACC, ROW_COV_ACC, ROW_BIAS,
+ ROW_BIAS_SD, ROW_MAG, ROW_RELIABILITY, FLAGS_WORD) = (
     ORIENTATION_DTYPE.fields[name][1] // 8 for name in ORIENTATION_DTYPE.names[:-1])
 
 # Float state common to all kernels.
@@ -53,9 +57,8 @@ U = 4              # the same without corrections: the chain of gyroscope rotati
 GYR_LAST = 8       # last raw rate
 GYR_BIAS = 11
 FIELD = 14         # local magnetic field in world axes, tesla
-MAG = 17           # magnetometer samples since the last row: sum in present imu axes
-MAG_WEIGHT = 20    # sum of their reliabilities
-HISTORY = 24       # ring of U
+LAG = 17           # how much later magnetometer samples are stamped than rates, s
+HISTORY = 18       # ring of U
 HISTORY_LENGTH = 256
 PENDING = HISTORY + 4 * HISTORY_LENGTH   # samples that wait for the Imu to pass them
 PENDING_LENGTH = 8
@@ -66,24 +69,23 @@ LAST_STAMP = 0
 STARTED = 1
 HISTORY_COUNT = 2
 PENDING_COUNT = 3
-MAG_COUNT = 4      # magnetometer samples since the last row
-HEADING_KNOWN = 5
-LAST_MAG_STAMP = 6
-IMU_USED, IMU_REJECTED, MAG_USED, MAG_REJECTED, MAG_LATE, MAG_DISTURBED = 7, 8, 9, 10, 11, 12
-GAPS, SATURATED = 13, 14
-ALIGN_UNTIL = 15   # stamp of the end of the alignment interval
-HISTORY_STAMPS = 16
+HEADING_KNOWN = 4
+ALIGN_UNTIL = 5    # stamp of the end of the alignment interval
+IMU_USED, IMU_REJECTED, MAG_USED, MAG_REJECTED, MAG_LATE, MAG_DISTURBED = range(6, 12)
+GAPS, SATURATED = 12, 13
+HISTORY_STAMPS = 14
 PENDING_STAMPS = HISTORY_STAMPS + HISTORY_LENGTH
 K_COMMON = PENDING_STAMPS + PENDING_LENGTH
 
 # Parameters common to all kernels, one float64 array.
-P_GYR_DELAY, P_MAG_DELAY, P_MAX_LAG, P_MAX_GAP, P_GYR_DENSITY, P_ACC_DENSITY = range(6)
-P_ACC_BIAS_SD, P_MAG_SD, P_RELIABILITY, P_GAP_RATE_SD, P_BIAS_WALK = range(6, 11)
-P_RANGE = 11       # (3,) gyroscope limit, inf if none
+P_GYR_DELAY, P_MAX_LAG, P_MAX_GAP, P_GYR_DENSITY, P_ACC_DENSITY, P_ACC_BIAS_SD = range(6)
+P_MAG_SD, P_RELIABILITY, P_GAP_RATE_SD, P_BIAS_WALK, P_DECLINATION = range(6, 11)
+P_RANGE = 11       # (3,) gyroscope limit, inf if none, nan if it is to be found
 P_FRAME = 14       # (4,) rotation from ENU to the published world frame
 P_IRON_OFFSET = 18  # (3,) tesla
 P_IRON_MATRIX = 21  # (9,) row by row
 P_COMMON = 30
+TAKEN_WORDS = 10   # per magnetometer sample taken: field (3), rate (3), rotation (4)
 
 
 @njit(cache=True)
@@ -104,26 +106,28 @@ def push_rotation(x, k, stamp, phi):
 
 
 @njit(cache=True)
-def rotation_since(x, k, stamp, out):
+def rotation_since(x, k, stamp, turn, rate):
     """Rotation from the imu axes at ``stamp`` to those of the newest Imu sample.
 
-    Writes the quaternion q with ``v_imu_now = rotate(q, v_imu_then)`` to ``out`` (4,).
-    Returns False where the history does not reach back that far.
+    Writes the quaternion q with ``v_imu_now = rotate(q, v_imu_then)`` to ``turn`` (4,)
+    and the rate of turn at that time, rad/s, to ``rate`` (3,). Returns False where the
+    history does not reach back that far.
     """
     count = k[HISTORY_COUNT]
-    reach = min(count, HISTORY_LENGTH)
     newer = -1
-    for back in range(reach):
+    for back in range(min(count, HISTORY_LENGTH)):
         slot = (count - 1 - back) % HISTORY_LENGTH
         here = k[HISTORY_STAMPS + slot]
-        if here <= stamp:
+        if here < stamp or (here == stamp and (newer >= 0 or count == 1)):
             u = x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4].copy()
-            if newer >= 0 and here < stamp:
+            rate[:] = 0.0
+            if newer >= 0:
                 u_newer = x[HISTORY + 4 * newer:HISTORY + 4 * newer + 4]
-                part = (stamp - here) / (k[HISTORY_STAMPS + newer] - here)
+                span = k[HISTORY_STAMPS + newer] - here
                 step = quat_log(quat_multiply(quat_conjugate(u), u_newer))
-                u = quat_multiply(u, quat_exp(part * step))
-            out[:] = quat_multiply(quat_conjugate(x[U:U + 4]), u)
+                rate[:] = step / (span * 1e-9)
+                u = quat_multiply(u, quat_exp((stamp - here) / span * step))
+            turn[:] = quat_multiply(quat_conjugate(x[U:U + 4]), u)
             return True
         newer = slot
     return False
@@ -139,7 +143,6 @@ def push_mag(x, k, par, stamp, mag):
     if not is_finite3(mag) or not k[STARTED]:
         k[MAG_REJECTED] += 1
         return
-    delay = par[P_MAG_DELAY] - par[P_GYR_DELAY]
     if k[LAST_STAMP] - stamp > par[P_MAX_LAG] * 1e9:
         k[MAG_LATE] += 1
         return
@@ -158,37 +161,46 @@ def push_mag(x, k, par, stamp, mag):
                 x[PENDING + 3 * i + j] = x[PENDING + 3 * i + 3 + j]
         k[PENDING_COUNT] -= 1
     slot = k[PENDING_COUNT]
-    k[PENDING_STAMPS + slot] = stamp - np.int64(math.floor(delay * 1e9 + 0.5))
+    k[PENDING_STAMPS + slot] = stamp - np.int64(math.floor(x[LAG] * 1e9 + 0.5))
     x[PENDING + 3 * slot:PENDING + 3 * slot + 3] = calibrated
     k[PENDING_COUNT] += 1
 
 
 @njit(cache=True)
-def take_mags(x, k, par):
-    """Carry the waiting samples that the newest Imu sample has passed into its axes.
+def take_mags(x, k, taken):
+    """The waiting samples that the newest Imu sample has passed.
 
-    Adds them to the running sum at MAG; returns how many were added.
+    Writes one row of ``taken`` (PENDING_LENGTH, TAKEN_WORDS) for each: field in imu axes
+    at its own time (3), rate of turn then (3), rotation from there to the newest Imu
+    sample (4). Returns how many.
     """
-    taken = 0
+    count = 0
     kept = 0
-    turn = np.empty(4)
     for i in range(k[PENDING_COUNT]):
         when = k[PENDING_STAMPS + i]
-        sample = x[PENDING + 3 * i:PENDING + 3 * i + 3].copy()
         if when > k[LAST_STAMP]:
             k[PENDING_STAMPS + kept] = when
-            x[PENDING + 3 * kept:PENDING + 3 * kept + 3] = sample
-            kept += 1
-        elif rotation_since(x, k, when, turn):
-            now = quat_rotate(turn, sample)
             for j in range(3):
-                x[MAG + j] += now[j]
-            taken += 1
+                x[PENDING + 3 * kept + j] = x[PENDING + 3 * i + j]
+            kept += 1
+        elif rotation_since(x, k, when, taken[count, 6:10], taken[count, 3:6]):
+            taken[count, :3] = x[PENDING + 3 * i:PENDING + 3 * i + 3]
+            count += 1
         else:
             k[MAG_LATE] += 1
     k[PENDING_COUNT] = kept
-    k[MAG_COUNT] += taken
-    return taken
+    return count
+
+
+@njit(cache=True)
+def is_newer(k, stamp, sample):
+    """Whether an Imu sample can be used: finite, and newer than the last. Counts it."""
+    good = is_finite3(sample[:3]) and is_finite3(sample[3:6])
+    if not good or (k[STARTED] and stamp <= k[LAST_STAMP]):
+        k[IMU_REJECTED] += 1
+        return False
+    k[IMU_USED] += 1
+    return True
 
 
 @njit(cache=True)
@@ -202,8 +214,8 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
     """
     frame = par[P_FRAME:P_FRAME + 4]
     ahead = quat_multiply(quat, quat_exp(par[P_GYR_DELAY] * gyr))
-    row_int[_STAMP] = stamp
-    row[_QUAT:_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
+    row_int[ROW_STAMP] = stamp
+    row[ROW_QUAT:ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
     r = quat_to_matrix(ahead)
     for i in range(3):
         for j in range(3):
@@ -211,14 +223,14 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
             for m in range(3):
                 for n in range(3):
                     total += r[m, i] * cov_world[m, n] * r[n, j]
-            row[_COV + 3 * i + j] = total
-            row[_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
-            row[_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
+            row[ROW_COV + 3 * i + j] = total
+            row[ROW_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
+            row[ROW_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
     for i in range(3):
-        row[_GYR + i] = gyr[i]
-        row[_ACC + i] = acc[i]
-        row[_BIAS + i] = bias[i]
-        row[_BIAS_SD + i] = math.sqrt(max(bias_var[i], 0.0))
-    row[_MAG:_MAG + 3] = quat_rotate(frame, quat_rotate(quat, mag))
-    row[_REL] = reliability
-    row_int[_FLAGS] = flags + (mag_count << 32)
+        row[ROW_GYR + i] = gyr[i]
+        row[ROW_ACC + i] = acc[i]
+        row[ROW_BIAS + i] = bias[i]
+        row[ROW_BIAS_SD + i] = math.sqrt(max(bias_var[i], 0.0))
+    row[ROW_MAG:ROW_MAG + 3] = quat_rotate(frame, quat_rotate(quat, mag))
+    row[ROW_RELIABILITY] = reliability
+    row_int[FLAGS_WORD] = flags + (mag_count << 32)

@@ -4,11 +4,11 @@ import numpy as np
 
 from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation_state import FLAG_STILL
-from imu_fusion.messages.convert import (bool_message, imu_values, mag_values,
-                                         orientation_message, rpy_message)
+from imu_fusion.messages.convert import (SAMPLE_TYPES, bool_message, orientation_message,
+                                         rpy_message)
 from imu_fusion.messages.layouts import BOOL_TYPE, IMU, MAG, VECTOR3
 from imu_fusion.messages.streams import Stream
-from imu_fusion.samples import ImuLog, MagLog, checks
+from imu_fusion.samples import MagLog, checks
 
 IMU_TOPIC = "imu/data_raw"
 MAG_TOPIC = "imu/mag"
@@ -17,7 +17,7 @@ RPY_TOPIC = "imu/rpy/filtered"
 STEADY_TOPIC = "imu/steady_state"
 
 # A magnetometer sample comes before the Imu sample of its stamp, which then uses it.
-INPUTS = {MAG_TOPIC: (MAG, mag_values), IMU_TOPIC: (IMU, imu_values)}
+INPUTS = {MAG_TOPIC: SAMPLE_TYPES[MAG.msgtype], IMU_TOPIC: SAMPLE_TYPES[IMU.msgtype]}
 OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TOPIC: BOOL_TYPE}
 
 
@@ -62,20 +62,12 @@ class OrientationStream(Stream):
     def flush(self):
         self._write(self.estimator.finish())
 
-    def look_at(self, topic, first):
-        logs = {}
-        for name, rows in first.items():
-            stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
-            samples = np.array([sample for _, sample in rows])
-            if name == IMU_TOPIC and rows:
-                logs[name] = ImuLog(stamps, samples[:, :3], samples[:, 3:])
-            elif rows:
-                logs[name] = MagLog(stamps, samples)
+    def look_at(self, topic, logs):
         if topic == IMU_TOPIC:
             found = checks.check_acceleration(logs[topic].acc, logs[topic].stamp, topic)
         else:
             found = checks.check_field(logs[topic].mag, topic)
-        if len(logs) == 2 and len(logs[IMU_TOPIC]) == len(logs[MAG_TOPIC]):
+        if len(logs) == 2:
             found += checks.check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
         return [finding.text for finding in found]
 
@@ -98,12 +90,13 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def run(params, logs):
+def run(params, logs, report):
     """The messages that :class:`OrientationStream` emits for a session, from whole logs.
 
     Args:
         params: OrientationParams.
         logs: dict of input topic to (log, epochs) of guarded samples.
+        report: gets the estimator's ``results``.
 
     Yields:
         (topic, stamp, cdr)
@@ -118,3 +111,4 @@ def run(params, logs):
         rows = [estimator.run(imu[imu_epochs == epoch], mag[mag_epochs == epoch]),
                 estimator.finish()]
         yield from writer.messages(np.concatenate(rows), imu.frame_id)
+    report.results = estimator.summary()

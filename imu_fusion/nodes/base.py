@@ -3,7 +3,6 @@
 import importlib
 import signal
 import sys
-import time
 
 import rclpy
 import rclpy.node
@@ -15,6 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+from imu_fusion.nodes.flow import steady_timer
 
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
@@ -104,7 +104,7 @@ class Node(rclpy.node.Node):
             array.header.stamp = self.get_clock().now().to_msg()
             self._diagnostics.publish(array)
 
-        self.create_timer(1.0, publish)
+        steady_timer(self, 1.0, publish)
 
     def _declare(self):
         # rclpy has declared what was given, with the type that it was given in. Take it
@@ -141,30 +141,17 @@ class Node(rclpy.node.Node):
         return values
 
     def _on_set_parameters(self, parameters):
+        changed = dict(self._params)
         for parameter in parameters:
             for cls in self.PARAMETERS:
-                for info in cls.infos():
-                    if info.name == parameter.name:
-                        try:
-                            self._params[cls] = self._params[cls].replace(
-                                **{info.name.replace(".", "__"): parameter.value})
-                        except ParameterError as error:
-                            return SetParametersResult(successful=False, reason=str(error))
+                if any(info.name == parameter.name for info in cls.infos()):
+                    try:
+                        changed[cls] = changed[cls].replace(
+                            **{parameter.name.replace(".", "__"): parameter.value})
+                    except ParameterError as error:
+                        return SetParametersResult(successful=False, reason=str(error))
+        self._params = changed
         return SetParametersResult(successful=True)
-
-
-def spin(executor, nodes, until, timeout):
-    """Run ``nodes`` until ``until()`` is true or ``timeout`` seconds have passed; for tests.
-
-    Returns:
-        Whether ``until()`` became true.
-    """
-    deadline = time.monotonic() + timeout
-    while not until():
-        if time.monotonic() > deadline:
-            return False
-        executor.spin_once(timeout_sec=min(node.work() for node in nodes))
-    return True
 
 
 def run_node(node_class, args=None):

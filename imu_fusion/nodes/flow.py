@@ -31,6 +31,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
 from rclpy.qos import (
     DurabilityPolicy, HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy,
     qos_check_compatible)
@@ -94,6 +95,11 @@ def subscribe_raw(node, msg_type, topic, callback, qos, batch=100):
 
     subscription = node.create_subscription(msg_type, topic, on_message, qos, raw=True)
     return subscription
+
+
+def steady_timer(node, period, callback):
+    """A timer of real time: also under use_sim_time, and while nobody publishes /clock."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def type_name(msg_type):
@@ -192,7 +198,7 @@ class FlowSource:
         self.foreign = {}
         self._status = node.create_publisher(DiagnosticStatus, STATUS_TOPIC, _STATUS_OFFERED)
         node.create_subscription(DiagnosticStatus, ACK_TOPIC, self._on_ack, _ACK_QOS)
-        node.create_timer(0.1, self._watch)
+        steady_timer(node, 0.1, self._watch)
 
     def publisher(self, msg_type, topic, qos=None):
         """Make a :class:`FlowPublisher`; all of them before the session begins."""
@@ -283,8 +289,14 @@ class FlowSource:
 
     def _refresh(self):
         """Compare consumers with the graph: joined, vanished, foreign."""
-        sinks = {_full_name(i) for i in self._node.get_publishers_info_by_topic(ACK_TOPIC)
-                 if i.node_name != _UNKNOWN_NODE} - {self._name}
+        names = [_full_name(i) for i in self._node.get_publishers_info_by_topic(ACK_TOPIC)
+                 if i.node_name != _UNKNOWN_NODE]
+        sinks = set(names) - {self._name}
+        if len(names) > len(set(names)):
+            self._node.get_logger().warning(
+                "several nodes have the same name; their acknowledgements cannot be told apart: "
+                + ", ".join(sorted(n for n in sinks if names.count(n) > 1))
+                + "; rename all but one with -r __node:=NAME", once=True)
         self._seen |= sinks
         if not self._announced:
             for name in sinks - self._consumers.keys():
@@ -422,7 +434,7 @@ class FlowSink:
         self.sessions = {}  # open ones, by source
         self._ack = node.create_publisher(DiagnosticStatus, ACK_TOPIC, _ACK_QOS)
         node.create_subscription(DiagnosticStatus, STATUS_TOPIC, self._on_status, _STATUS_HEARD)
-        node.create_timer(0.5, self._watch)
+        steady_timer(node, 0.5, self._watch)
 
     def subscribe(self, msg_type, topic, callback, qos=None):
         """Subscribe to CDR bytes: ``callback(cdr, info)``; returns the :class:`Inbox`."""
@@ -454,6 +466,10 @@ class FlowSink:
         while self._unconfirmed:
             session = self._unconfirmed.pop()
             self._send_ack(session, self._taken(session), DONE)
+
+    def feeding(self):
+        """The open sessions of which this node takes topics."""
+        return [s for s in self.sessions.values() if self._taken(s)]
 
     def _taken(self, session):
         return [self.inboxes[t] for t in session.topics if t in self.inboxes
@@ -639,19 +655,15 @@ class Relay:
         self.source.end()
 
     def _begin(self, session):
-        if not self._open_sessions():
+        feeding = self.sink.feeding()
+        if session not in feeding:
             return
-        if len(self._open_sessions()) == 1:
+        if len(feeding) == 1:
             self.source.begin()
-        self._stage.reset(sorted({topic for s in self._open_sessions() for topic in s.topics
+        self._stage.reset(sorted({topic for s in feeding for topic in s.topics
                                   if topic in self.sink.inboxes}))
 
     def _end(self, session):
-        if not self._open_sessions():
+        if not self.sink.feeding():
             self._finishing = NEXT if session.event == NEXT else END
             self.pump()
-
-    def _open_sessions(self):
-        """The open sessions that feed this node."""
-        return [s for s in self.sink.sessions.values()
-                if s.topics.keys() & self.sink.inboxes.keys()]

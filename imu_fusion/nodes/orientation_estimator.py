@@ -4,8 +4,9 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages.orientation_stream import OUTPUTS, OrientationStream
+from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.nodes.base import run_node
-from imu_fusion.nodes.estimator import EstimatorNode, EstimatorNodeParams
+from imu_fusion.nodes.estimator import EstimatorNode
 
 
 class OrientationEstimatorNode(EstimatorNode):

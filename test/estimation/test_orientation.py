@@ -22,7 +22,7 @@ def errors_deg(rows, truth):
     return np.degrees(error.magnitude())
 
 
-@pytest.fixture(scope="module", params=["gyro_mag"])
+@pytest.fixture(scope="module", params=["gyro_mag", "fusion"])
 def params(request):
     return OrientationParams(method=request.param)
 

@@ -1,5 +1,6 @@
 """The protocol of nodes/flow.py between nodes of this process."""
 
+import rclpy
 from std_msgs.msg import Int64
 
 from imu_fusion.nodes import flow
@@ -238,3 +239,17 @@ def test_sink_that_takes_nothing_answers_and_is_not_waited_for_at_the_end(graph)
     sender.session(10)
     graph.until(lambda: receiver.ended and sender.source.session is None)
     assert sender.source.report() == {"/numbers": (10, {"/receiver": 0})}
+
+
+def test_remapped_names_are_those_of_the_graph(graph):
+    """Both ends speak of resolved names: a remapped sink is known to take the topic."""
+    node = graph.add(rclpy.create_node("remapped", cli_args=[
+        "--ros-args", "-r", "/private:=/numbers", "-r", "__ns:=/deep"]))
+    got = []
+    sink = FlowSink(node)
+    inbox = sink.subscribe(Int64, "/private", lambda cdr, info: got.append(cdr))
+    sender = Sender(graph, wait_for=["/deep/remapped"])
+    sender.session(10)
+    graph.until(lambda: sender.source.session is None)
+    assert inbox.topic == "/numbers" and len(got) == 10
+    assert sender.source.report() == {"/numbers": (10, {"/deep/remapped": 0})}

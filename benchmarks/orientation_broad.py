@@ -1,0 +1,178 @@
+"""BROAD: orientation error beside VQF, Madgwick, Mahony and imufusion, in one run.
+
+Every estimator runs with and without compensation of the sensors' delays (gyroscope
+and accelerometer 4 ms, magnetometer 15 ms behind the optical reference: properties
+of the data set, known before). Where something is tuned, it is one parameter set
+for all trials, chosen by leave-one-trial-out: the figures of a trial come from
+the set that was best on the others.
+"""
+
+import itertools
+
+import ahrs.filters
+import imufusion
+import numpy as np
+from scipy.spatial.transform import Rotation
+from vqf import VQF, offlineVQF
+
+from benchmarks.data import broad_errors, broad_trials, load_broad
+from benchmarks.table import write_table
+from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.samples.logs import ImuLog, MagLog
+
+GYR_DELAY, MAG_DELAY = 0.004, 0.015
+# Rotations from the worlds of the peers into ENU.
+_FROM_NWU = Rotation.from_euler("Z", 90, degrees=True)
+_FROM_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+# chi2 with 3 degrees of freedom, the probability of 3 sigma of a normal variate.
+_THREE_SIGMA = 14.156
+
+
+def advance(log, column, delay):
+    """Samples of ``column`` as they would be without delay, by linear interpolation."""
+    t = log.stamp * 1e-9
+    return np.column_stack([np.interp(t + delay, t, v) for v in getattr(log, column).T])
+
+
+def compensated(imu, mag):
+    """The logs with their delays taken out (accelerometer and gyroscope share a chip)."""
+    return (ImuLog(imu.stamp, advance(imu, "gyr", GYR_DELAY), advance(imu, "acc", GYR_DELAY)),
+            MagLog(mag.stamp, advance(mag, "mag", MAG_DELAY)))
+
+
+def vqf(imu, mag, tau_acc=3.0, tau_mag=9.0):
+    dt = (imu.stamp[-1] - imu.stamp[0]) * 1e-9 / (len(imu) - 1)
+    out = VQF(dt, tauAcc=tau_acc, tauMag=tau_mag).updateBatch(imu.gyr, imu.acc, mag.mag * 1e6)
+    return out["quat9D"][:, [1, 2, 3, 0]]
+
+
+def offline_vqf(imu, mag, tau_acc=3.0, tau_mag=9.0):
+    dt = (imu.stamp[-1] - imu.stamp[0]) * 1e-9 / (len(imu) - 1)
+    out = offlineVQF(imu.gyr, imu.acc, mag.mag * 1e6, dt, dict(tauAcc=tau_acc, tauMag=tau_mag))
+    return out["quat9D"][:, [1, 2, 3, 0]]
+
+
+def madgwick(imu, mag):
+    f = ahrs.filters.Madgwick(imu.gyr, imu.acc, mag.mag * 1e9, frequency=_frequency(imu))
+    return (_FROM_NWU * Rotation.from_quat(f.Q[:, [1, 2, 3, 0]])).as_quat()
+
+
+def mahony(imu, mag):
+    f = ahrs.filters.Mahony(imu.gyr, imu.acc, mag.mag * 1e6, frequency=_frequency(imu))
+    return (_FROM_NWU * Rotation.from_quat(f.Q[:, [1, 2, 3, 0]])).as_quat()
+
+
+def fusion(imu, mag):
+    """imufusion with its documented example settings."""
+    filter_ = imufusion.Ahrs()
+    settings = imufusion.AhrsSettings()
+    settings.convention = imufusion.CONVENTION_ENU
+    settings.sample_period = 1.0 / _frequency(imu)
+    settings.gain = 0.5
+    settings.gyroscope_range = 2000
+    settings.acceleration_rejection = 10
+    settings.magnetic_rejection = 10
+    settings.recovery_trigger_period = int(5 * _frequency(imu))
+    filter_.set_settings(settings)
+    gyr, acc, field = np.degrees(imu.gyr), imu.acc / 9.80665, mag.mag * 1e6
+    quat = np.empty((len(imu), 4))
+    for i in range(len(imu)):
+        filter_.update(gyr[i], acc[i], field[i])
+        quat[i] = filter_.get_quaternion()
+    return quat[:, [1, 2, 3, 0]]
+
+
+def ours(imu, mag, **changes):
+    """Rows of the orientation estimator."""
+    return OrientationEstimator(OrientationParams(**changes)).run(imu, mag)
+
+
+def share_within(rows, reference, mask):
+    """Share of masked samples whose error lies within 3 sigma of the estimate."""
+    keep = mask & np.isfinite(reference).all(axis=1)
+    error = (Rotation.from_quat(rows["quat_world_imu"][keep]).inv()
+             * Rotation.from_quat(reference[keep])).as_rotvec()
+    distance = np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_attitude"][keep]), error)
+    return float((distance < _THREE_SIGMA).mean())
+
+
+def _frequency(imu):
+    return (len(imu) - 1) / ((imu.stamp[-1] - imu.stamp[0]) * 1e-9)
+
+
+def leave_one_out(errors):
+    """errors: (sets, trials, 3). Per trial, the errors of the set best on the others."""
+    chosen = []
+    for trial in range(errors.shape[1]):
+        others = np.delete(errors[:, :, 0], trial, axis=1).mean(axis=1)
+        chosen.append(errors[int(np.argmin(others)), trial])
+    return np.array(chosen)
+
+
+def main():
+    trials = [load_broad(path) for path in broad_trials()]
+    if not trials:
+        print("BROAD is not here: set IMU_FUSION_DATA (see benchmarks/data.py)")
+        return
+    prepared = [[(imu, mag) for imu, mag, _, _ in trials],
+                [compensated(imu, mag) for imu, mag, _, _ in trials]]
+
+    def score(run, delays):
+        return np.array([broad_errors(run(*logs), ref, mask) for logs, (_, _, ref, mask)
+                         in zip(prepared[delays], trials, strict=True)])
+
+    rows = []
+
+    def add(name, tuning, plain, delayed, share=""):
+        rows.append([name, tuning, *(" / ".join(f"{v:.2f}" for v in e.mean(axis=0))
+                                     for e in (plain, delayed)),
+                     " ".join(f"{v:.1f}" for v in delayed[:, 0]), share])
+        print(rows[-1], flush=True)
+
+    for name, run in [("Madgwick (ahrs)", madgwick), ("Mahony (ahrs)", mahony),
+                      ("imufusion", fusion), ("VQF", vqf), ("OfflineVQF", offline_vqf)]:
+        add(name, "defaults", score(run, 0), score(run, 1))
+    grid = list(itertools.product((1.0, 2.0, 3.0, 5.0), (9.0, 20.0, 40.0, 80.0)))
+    for name, run in [("VQF", vqf), ("OfflineVQF", offline_vqf)]:
+        add(name, "leave one out", *(leave_one_out(np.array(
+            [score(lambda i, m, s=s: run(i, m, *s), d) for s in grid])) for d in (0, 1)))
+
+    # Ours takes the gyroscope's delay as its parameter and finds the magnetometer's itself,
+    # so it always gets the recordings as they are.
+    def mine(**changes):
+        results = [ours(imu, mag, **changes) for imu, mag in prepared[0]]
+        errors = np.array([broad_errors(r["quat_world_imu"], ref, mask)
+                           for r, (_, _, ref, mask) in zip(results, trials, strict=True)])
+        share = np.mean([share_within(r, ref, mask)
+                         for r, (_, _, ref, mask) in zip(results, trials, strict=True)])
+        return errors, share
+
+    for name, changes in [("gyro_mag (Winkler 2025)", dict(method="gyro_mag")),
+                          ("fusion, causal", {}), ("fusion, smoothed", dict(mode="smoothed"))]:
+        delays = dict(gyr_delay=GYR_DELAY)
+        if name.startswith("gyro_mag"):
+            delays["mag_delay"] = MAG_DELAY
+        plain, _ = mine(**changes)
+        errors, share = mine(**changes, **delays)
+        add(name, "defaults", plain, errors, f"{100 * share:.0f} %")
+        if "method" in changes:
+            continue
+        default = OrientationParams()
+        sets = [dict(zip(("velocity_walk", "mag_sd", "gyr_noise_density"), scales, strict=True))
+                for scales in itertools.product((0.5, 1.0, 2.0), repeat=3)]
+        errors = np.array([[mine(**changes, **d, **{
+            k: getattr(default, k) * v for k, v in s.items()})[0] for s in sets]
+            for d in ({}, delays)])
+        add(name, "leave one out", *map(leave_one_out, errors))
+
+    names = " ".join(path.name[:2] for path in broad_trials())
+    write_table("orientation_broad", [
+        "estimator", "parameters", "as recorded: total / heading / inclination, deg",
+        "delays compensated", f"total of trials {names}", "within 3 sigma"], rows,
+        note=f"BROAD (Laidig et al. 2021), {len(trials)} trials: RMSE over the samples in "
+             "motion, mean over the trials. 'Within 3 sigma' counts samples of the default run "
+             "whose attitude error has a Mahalanobis distance below the 99.73 % quantile.")
+
+
+if __name__ == "__main__":
+    main()
