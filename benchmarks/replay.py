@@ -78,17 +78,18 @@ def main(runs=10):
     lines = [
         f"{DURATION} s at {RATE} Hz Imu and MagneticField (the samples of bags/{BAG.name}, "
         "repeated) at rate 0 through replayer, orientation_estimator and recorder: three "
-        f"processes over Fast DDS on {os.cpu_count()} cores that others used too (load: mean number of "
-        f"processes that want a core, ours included). {messages} messages recorded per run, each by its stamp.",
+        f"processes over Fast DDS on {os.cpu_count()} cores that others used too (load: mean "
+        f"number of processes that want a core, ours included). {messages} messages recorded per run, "
+        "compared by their stamps.",
         "",
         "| run | lost imu/data_raw | lost imu/mag | lost imu/data | first to last message s | "
-        "with start and end s | CPU s of the three | load of the machine | real-time factor | "
+        "with start and end s | CPU s of the three | load | real-time factor | "
         "recorded messages/s |",
         "|---|---|---|---|---|---|---|---|---|---|"]
     for i, (lost, took, total, cpu, load) in enumerate(rows):
-        lines.append(f"| {i + 1} | " + " | ".join(str(lost[t]) for t in TOPICS)
-                     + f" | {took:.1f} | {total:.1f} | {cpu:.0f} | {load:.1f} | {DURATION / took:.1f} "
-                       f"| {messages / took:.0f} |")
+        cells = [str(i + 1), *(str(lost[t]) for t in TOPICS), f"{took:.1f}", f"{total:.1f}",
+                 f"{cpu:.0f}", f"{load:.1f}", f"{DURATION / took:.1f}", f"{messages / took:.0f}"]
+        lines.append("| " + " | ".join(cells) + " |")
     lines += ["", f"Lost in {runs} runs: {sum(sum(row[0].values()) for row in rows)}. "
               f"Real-time factor: median {DURATION / np.median(seconds):.1f}, "
               f"worst {DURATION / seconds.max():.1f}, best {DURATION / seconds.min():.1f}."]

@@ -145,7 +145,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
                 progress(f"{stage.node}: {report.summary}")
         found = {report.node: report.results for report in reports if report.results}
         (writer.directory / "results.json").write_text(json.dumps(found, indent=2))
-    return reports, warnings
+    return reports, list(dict.fromkeys(warnings))
 
 
 def _read(reader, names):

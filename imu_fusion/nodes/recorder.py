@@ -76,7 +76,7 @@ class Recorder(Node):
         self._failed = False
         # Under use_sim_time nothing is asked for before there is a time to record it at.
         self._flow = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end,
-                              hold=lambda: self._sim_time and not self.get_clock().now().nanoseconds)
+                              hold=lambda: self._sim_time and not self._now())
         steady_timer(self, 0.2, self._discover)
         self.start_diagnostics(lambda: (b"\0", "recording", dict(self._writer.counts)))
 
@@ -140,9 +140,11 @@ class Recorder(Node):
 
         self._flow.subscribe(cls, topic, store, adapted_qos(infos))
 
+    def _now(self):
+        return self.get_clock().now().nanoseconds
+
     def _write(self, topic, msgtype, cdr, info):
-        received = (self.get_clock().now().nanoseconds if self._sim_time
-                    else info["received_timestamp"] or time.time_ns())
+        received = self._now() if self._sim_time else info["received_timestamp"] or time.time_ns()
         try:
             self._writer.write(topic, msgtype, cdr, received, info["source_timestamp"] or received)
         except BagError:
