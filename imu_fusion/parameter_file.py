@@ -65,11 +65,8 @@ def parameters_for(classes, node, path=None, ignore=()):
     """
     if path is None:
         return [cls() for cls in classes]
-    nodes = load(path)
     known = {info.name for cls in classes for info in cls.infos()}
-    values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
-    values.update(flatten(nodes.get(node, {})))
-    values.pop("use_sim_time", None)
+    values = node_values(node, path, known)
     result = []
     for cls in classes:
         own = {info.name for info in cls.infos()}
@@ -78,6 +75,20 @@ def parameters_for(classes, node, path=None, ignore=()):
                 values[info.name] = resolve(values[info.name], path)
         result.append(cls.from_mapping(values, source=str(path), ignore=(*ignore, *(known - own))))
     return result
+
+
+def node_values(node, path, known):
+    """Names and values, dotted, that a file gives to a node: of ``/**`` only the known ones.
+
+    An empty dict without a file (path None).
+    """
+    if path is None:
+        return {}
+    nodes = load(path)
+    values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
+    values.update(flatten(nodes.get(node, {})))
+    values.pop("use_sim_time", None)
+    return values
 
 
 def resolve(value, parameter_file):

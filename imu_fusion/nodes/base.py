@@ -64,12 +64,14 @@ def descriptor(info):
 class Node(rclpy.node.Node):
     """Base of our nodes.
 
-    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses.
-    Unknown parameters, wrong types and values out of bounds raise ParameterError.
+    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses, and
+    ``OPEN_PREFIXES``: parameters below these need not be known, ``open_parameters`` holds them.
+    Other unknown parameters, wrong types and values out of bounds raise ParameterError.
     """
 
     NAME = ""
     PARAMETERS = ()
+    OPEN_PREFIXES = ()
 
     def __init__(self, **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
@@ -118,6 +120,10 @@ class Node(rclpy.node.Node):
                 given[name] = value.tolist() if hasattr(value, "tolist") else value
                 self.undeclare_parameter(name)
         known = {info.name: info for cls in self.PARAMETERS for info in cls.infos()}
+        self.open_parameters = {name: given.pop(name) for name in list(given)
+                                if name not in known and name.startswith(self.OPEN_PREFIXES)}
+        for name, value in self.open_parameters.items():
+            self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
@@ -152,8 +158,15 @@ class Node(rclpy.node.Node):
                             **{parameter.name.replace(".", "__"): parameter.value})
                     except ParameterError as error:
                         return SetParametersResult(successful=False, reason=str(error))
+        try:
+            self.apply(changed)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         self._params = changed
         return SetParametersResult(successful=True)
+
+    def apply(self, params):
+        """Parameters are about to change to ``params`` (class to object); may refuse."""
 
 
 def run_node(node_class, args=None):
