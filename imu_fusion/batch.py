@@ -26,16 +26,17 @@ from imu_fusion.samples.guard import guard_log
 class Stage:
     """One estimator of the batch path.
 
-    ``run(params, logs, report)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
-    report; ``logs`` maps a topic to (log, epochs) of the samples fit for use, without optional
-    topics that the recording lacks. ``findings(logs)`` lists in words what looks wrong with
-    whole logs as recorded. ``node_params`` are those of the node alone: read, not used.
+    ``run(logs, report, *params)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
+    report; ``params`` are objects of the classes of that name; ``logs`` maps a topic to
+    (log, epochs) of the samples fit for use, without optional topics that the recording lacks.
+    ``findings(logs)`` lists in words what looks wrong with whole logs as recorded.
+    ``node_params`` are those of the node alone: read, not used.
     ``kinds`` maps topics to the SampleType that reads them where it is not the usual one of
     their message type; ``unusable`` says why the stage cannot run.
     """
 
     node: str
-    params: type
+    params: tuple
     node_params: tuple
     required: dict
     optional: dict
@@ -50,8 +51,8 @@ class Stage:
         """(Stage, parameters): with ``configure``, topics may depend on the parameters."""
         if self.configure is not None:
             return self.configure(self, params_file)
-        params, *_ = parameters_for([self.params, *self.node_params], self.node, params_file)
-        return self, params
+        params = parameters_for(self.params + self.node_params, self.node, params_file)
+        return self, params[:len(self.params)]
 
     def kind(self, topic, info):
         """The SampleType that reads a topic (bag.TopicInfo) of this stage."""
@@ -67,7 +68,7 @@ class StageReport:
     """
 
     node: str
-    params: object
+    params: list
     used: dict = field(default_factory=dict)
     refused: dict = field(default_factory=dict)
     written: Counter = field(default_factory=Counter)
@@ -83,15 +84,16 @@ def _types(inputs, topics):
 def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
-        Stage("orientation_estimator", OrientationParams, (EstimatorNodeParams,),
+        Stage("orientation_estimator",
+              (OrientationParams, orientation.OrientationOutputParams), (EstimatorNodeParams,),
               required=_types(orientation.INPUTS, [orientation.IMU_TOPIC]),
-              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC]),
+              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC, orientation.FIX_TOPIC]),
               outputs=orientation.OUTPUTS, run=orientation.run, findings=orientation.findings),
-        Stage("smoother", smoothing.SmoothingParams, (smoothing.SmootherNodeParams,),
+        Stage("smoother", (smoothing.SmoothingParams,), (smoothing.SmootherNodeParams,),
               required=_types(smoothing.INPUTS, smoothing.REQUIRED),
               optional=_types(smoothing.INPUTS, [smoothing.MAG_TOPIC, smoothing.VELOCITY_TOPIC]),
               outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings),
-        Stage(field_stream.NODE, field_stream.FieldConfiguration, (EstimatorNodeParams,),
+        Stage(field_stream.NODE, (field_stream.FieldConfiguration,), (EstimatorNodeParams,),
               required={}, optional={}, outputs=field_stream.OUTPUTS, run=field_stream.run,
               findings=lambda logs: [], configure=_configure_field),
     )}
@@ -107,7 +109,7 @@ def _configure_field(stage, params_file):
         stage, kinds=config.inputs, optional=_types(config.inputs, gyroscope),
         required=_types(config.inputs, [t for t in config.inputs if t not in gyroscope]),
         unusable="" if config.accelerometers else
-        "no accelerometers described; set accelerometers.names in a parameter file"), config
+        "no accelerometers described; set accelerometers.names in a parameter file"), [config]
 
 
 def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
@@ -178,7 +180,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
             progress(f"{stage.node}: "
                      + ", ".join(f"{len(log)} {names[topic]}" for topic, log in recorded.items()))
             warnings += stage.findings(recorded)
-            for topic, stamp, cdr in stage.run(report.params, inputs, report):
+            for topic, stamp, cdr in stage.run(inputs, report, *report.params):
                 writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
                 report.written[topic] += 1
             if report.summary:

@@ -166,6 +166,17 @@ class OrientationEstimator:
         self._new_chunk()
         self.reset()
 
+    def set_params(self, params):
+        """Go on with other parameters from the next sample on.
+
+        Raises:
+            ParameterError: another method or mode, which have another state.
+        """
+        if (params.method, params.mode) != (self.params.method, self.params.mode):
+            raise ParameterError("parameters 'method' and 'mode' cannot change while running: "
+                                 "start another estimator")
+        self.params, self._par = params, self._pack(params)
+
     def reset(self):
         """Forget all samples: the next ones start a new alignment."""
         self._x = np.zeros(self._kernel.X_SIZE)
@@ -173,6 +184,18 @@ class OrientationEstimator:
         self._waiting = []
         self._waiting_imus = 0
         self._alignment = None
+
+    def set_params(self, params):
+        """Change parameters of a running estimator; what it has learned stays.
+
+        Raises:
+            ParameterError: another method or mode, which needs a new estimator.
+        """
+        for name in ("method", "mode"):
+            if getattr(params, name) != getattr(self.params, name):
+                raise ParameterError(f"parameter '{name}' cannot change while the estimator runs")
+        self.params = params
+        self._par = self._pack(params)
 
     def add_imu(self, stamp, gyr, acc):
         """Take one Imu sample.

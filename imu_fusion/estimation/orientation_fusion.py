@@ -66,6 +66,7 @@ P_SIZE = st.P_COMMON + 23
 _REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
+_REST_TURN = 1.5e-3         # rad/s per axis: slower turning than 0.5 deg/s passes as rest
 _FIRST_FIELD_SD = 2e-3     # relative: noise of the field that the alignment averages
 _BURST_SHARE = 0.5         # of the block, while an axis is at its limit
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
@@ -107,16 +108,17 @@ def initialise(x, k, par, a):
     sd[es.SOFT:es.EXCESS] = par[P_SOFT_SD]
     x[COV:COV + N * N] = np.diag(sd ** 2).ravel()
     if a.field_world is not None:
-        _start_field(x, k, par, a.field_world, a.has_heading)
+        follow = 1.0 if par[P_FOLLOW_FIELD] or not a.at_rest else 0.0
+        _start_field(x, k, par, a.field_world, a.has_heading, follow)
 
 
 @njit(cache=True)
-def _start_field(x, k, par, z, has_heading):
+def _start_field(x, k, par, z, has_heading, follow):
     """Begin the field states with ``z`` (3,) tesla, measured here and now, world axes.
 
     The first sample makes the field share the tilt's error. With ``has_heading`` the
-    heading has no error but a constant one (heading_anchor 'rest'), or one that is known as
-    well as tilt and calibration, and is corrected when these are ('field').
+    heading has no error but a constant one, or with ``follow`` = 1 one that is known as well
+    as tilt and calibration, and is corrected when these are.
     """
     cov = x[COV:COV + N * N].reshape(N, N)
     x[NORM] = math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2)
@@ -126,7 +128,6 @@ def _start_field(x, k, par, z, has_heading):
         cov[i, :] = 0.0
         cov[:, i] = 0.0
         cov[i, i] = 1.0 if i < es.LOCAL else par[P_LOCAL_SD] ** 2
-    follow = par[P_FOLLOW_FIELD]
     if has_heading:
         cov[es.ATT + 2, es.ATT + 2] += follow
         x[HEADING_VAR] = par[P_HEADING_SD] ** 2 * (1.0 - follow)
@@ -175,7 +176,7 @@ def _fix_heading(x, k, par, z):
     horizontal = math.hypot(z[0], z[1])
     norm = math.sqrt(horizontal ** 2 + z[2] ** 2)
     if horizontal < 0.02 * norm:
-        _start_field(x, k, par, z, False)
+        _start_field(x, k, par, z, False, 0.0)
         return
     # The needle points to azimuth D: east sin D, north cos D.
     angle = 0.5 * math.pi - par[st.P_DECLINATION] - math.atan2(z[1], z[0])
@@ -188,7 +189,8 @@ def _fix_heading(x, k, par, z):
             cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j].copy())
         for j in range(N):
             cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3].copy())
-    _start_field(x, k, par, quat_rotate(turn, z), True)
+    # The sensor may be moving: what it shows now is no anchor.
+    _start_field(x, k, par, quat_rotate(turn, z), True, 1.0)
 
 
 @njit(cache=True)
@@ -393,7 +395,7 @@ def _is_still(x, k, par, stamp, dt, gyr, acc):
         force2 += (acc[i] - x[MEAN_FORCE + i]) ** 2
         mean2 += (x[MEAN_RATE + i] - x[S + es.BIAS + i]) ** 2
         slot = COV + (es.BIAS + i) * (N + 1)
-        limit2 += x[slot] + par[P_REST_RATE_SD] ** 2
+        limit2 += x[slot] + _REST_TURN ** 2
     if (rate2 > par[P_REST_RATE] ** 2 or force2 > par[P_REST_FORCE] ** 2
             or mean2 > 9.0 * limit2):
         k[REST_SINCE] = stamp

@@ -180,7 +180,7 @@ class AccelerationFieldStream(Stream):
                 self.emit(*message)
 
 
-def run(config, logs, report):
+def run(logs, report, config):
     """The messages that :class:`AccelerationFieldStream` emits for a session, from whole logs.
 
     The metrics of impacts, where there are any, go into the report's results.

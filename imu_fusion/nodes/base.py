@@ -156,8 +156,15 @@ class Node(rclpy.node.Node):
                             **{parameter.name.replace(".", "__"): parameter.value})
                     except ParameterError as error:
                         return SetParametersResult(successful=False, reason=str(error))
+        try:
+            self.apply(changed)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         self._params = changed
         return SetParametersResult(successful=True)
+
+    def apply(self, params):
+        """Parameters are about to change to ``params`` (class to object); may refuse."""
 
 
 def run_node(node_class, args=None):

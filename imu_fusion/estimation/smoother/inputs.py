@@ -169,14 +169,14 @@ def evaluate_constraints(constraints, position_world, stamp, events, margin):
         position_world: (N, 3) m, in the frame of the surface.
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
-        margin: s around the events without constraint.
+        margin: s around the events in which heights are free.
 
     Returns:
         start (N + 1,), residual (r,), gradient (r, 3), sigma (r,), height (r,).
     """
     pieces = []
-    late = np.int64(round(margin * 1e9))
     for constraint in constraints:
+        late = np.int64(round(margin * 1e9)) if constraint.height else np.int64(0)
         active = np.ones(len(stamp), bool)
         if constraint.phase == "in_run":
             active = stamp <= events.takeoff - late

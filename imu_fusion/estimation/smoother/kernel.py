@@ -16,13 +16,13 @@ import math
 import numpy as np
 from numba import njit
 
-from imu_fusion.estimation.smoother.model import (ATT, BODY_HEIGHT, FIX, LEVER_ARM, POS, VEL,
-                                                  VELOCITY, interval, predict_fix, predict_mag,
-                                                  predict_velocity)
+from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE, FIX,
+                                                  LEVER_ARM, POS, VEL, VELOCITY, interval,
+                                                  predict_fix, predict_mag, predict_velocity)
 from imu_fusion.geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 
-#: Longest list of non-zero entries of a measurement row.
-MAX_ENTRIES = 24
+#: Longest list of non-zero entries of a row: all states, should one not be finite.
+MAX_ENTRIES = CORE + sum(width for _, width in BLOCKS)
 
 #: Samples kept at once by the backward pass.
 SEGMENT = 128

@@ -33,9 +33,9 @@ class SmootherParams(Parameters):
                              low=0.0)
     max_gap: float = param(0.1, doc="Longest step between Imu samples that counts as sampled; "
                            "longer ones are bridged with unknown motion", unit="s", low=1e-3)
-    unknown_gyr_density: float = param(1.0, doc="Noise of the rate where it was clipped or not "
+    unknown_gyr_density: float = param(0.1, doc="Noise of the rate where it was clipped or not "
                                        "recorded", unit="rad/s/sqrt(Hz)", low=1e-3)
-    unknown_acc_density: float = param(5.0, doc="Noise of the force where it was clipped or not "
+    unknown_acc_density: float = param(2.0, doc="Noise of the force where it was clipped or not "
                                        "recorded", unit="m/s^2/sqrt(Hz)", low=1e-3)
 
     fix_sd: tuple[float, ...] = param((3.0, 3.0, 5.0), doc="Position noise east, north, up, "

@@ -97,14 +97,14 @@ class Smoother:
         hill = surface if isinstance(surface, Hill) and events is not None else None
 
         def refine(problem, events):
-            return refine_jump(hill, _positions(problem), imu, events)
+            return refine_jump(hill, _positions(problem), prepared.log, events)
 
         events, steps, converged, cov, var = iterated.solve(
             problem, events if hill is not None else None, refine)
         if not np.isfinite(problem.x).all():
             raise EstimationError("the smoother diverged: noise far below that of the data, or "
                                   "measurements of another recording")
-        return self._result(problem, frame, imu, hill, events, steps, converged, cov, var)
+        return self._result(problem, frame, hill, events, steps, converged, cov, var)
 
     def _problem(self, prepared, frame, measurements, constraints, fix):
         p = self.params
@@ -177,7 +177,7 @@ class Smoother:
             candidates = 12 if reading is None else 4
         problem.search_heading(initial.headings(initial_quat, candidates))
 
-    def _result(self, problem, frame, imu, hill, events, steps, converged, cov, var):
+    def _result(self, problem, frame, hill, events, steps, converged, cov, var):
         recorded = problem.imu.recorded
         x, layout, log = problem.x[recorded], problem.layout, problem.imu.log
         cov, sd = cov[recorded], np.sqrt(np.maximum(var[recorded], 0.0))
@@ -210,7 +210,7 @@ class Smoother:
                        for kind, name in _KINDS.items() if np.any(kinds == kind)}
         jump = None
         if hill is not None:
-            jump = jump_result(hill, samples, imu, events)
+            jump = jump_result(hill, samples, log, events)
         return SmootherResult(samples, frame, states, innovations, tuple(problem.cost), steps,
                               converged, events, jump)
 
