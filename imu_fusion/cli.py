@@ -139,19 +139,13 @@ def _number(value, form):
 @click.argument("source", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
-@click.option("--columns", type=click.Path(), metavar="YAML",
-              help="SOURCE is CSV of an accelerometer array: its columns, units and positions.")
 @remap_option
 @overwrite_option
-def convert(source, out, topics, columns, remap, overwrite):
+def convert(source, out, topics, remap, overwrite):
     """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
 
-    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With
-    --columns, SOURCE is CSV; the parameters for `process` are written beside the recording.
+    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT.
     """
-    if columns is not None:
-        _convert_table(source, out, columns, overwrite)
-        return
     from imu_fusion.messages.bag import BagWriter, open_bag
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
@@ -165,19 +159,6 @@ def convert(source, out, topics, columns, remap, overwrite):
                     writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
                                  qos=reader.topics[topic].qos_profiles or None)
     click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
-
-
-def _convert_table(source, out, columns, overwrite):
-    import yaml
-
-    from imu_fusion.messages.bag import BagWriter
-    from imu_fusion.messages.table import convert_table
-    with BagWriter(out, overwrite=overwrite) as writer:
-        parameters = convert_table(source, columns, writer)
-    target = Path(out) / "acceleration_field.yaml"
-    target.write_text(yaml.safe_dump(parameters, sort_keys=False))
-    click.echo(f"written: {out} with {sum(writer.counts.values())} messages, and {target} for "
-               "process --params-file")
 
 
 @cli.command(context_settings=PASS_ON)
