@@ -18,7 +18,7 @@ terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report, *terrain]
 
-nodes = ["replayer", "recorder", "orientation_estimator", "smoother"]
+nodes = ["replayer", "recorder", "orientation_estimator", "smoother", "pipeline"]
 
 setup(
     name=package_name,

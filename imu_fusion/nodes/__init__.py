@@ -1,4 +1,4 @@
 """ROS 2 nodes: thin adapters that decode, call an estimator and encode."""
 
-NODES = ("replayer", "recorder", "orientation_estimator", "smoother")
+NODES = ("replayer", "recorder", "orientation_estimator", "smoother", "pipeline")
 """Module names; each has ``main(args)`` and is an executable of the package."""
