@@ -13,12 +13,13 @@ def tree(source, target, patterns):
 
 # PyPI builds of ROS 2 Jazzy, for machines without an apt ROS. Never mix the two.
 ros = ["ros-jazzy-rclpy>=7.1,<8", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"]
-report = ["plotly>=5.20"]
+report = ["plotly>=5.15"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report, *terrain]
 
-nodes = ["replayer", "recorder", "orientation_estimator"]
+nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
+         "acceleration_field_estimator"]
 
 setup(
     name=package_name,

@@ -3,13 +3,15 @@
     python bags/make_bags.py [--source DIR] [--out DIR] [NAME ...]
 
 DIR holds ``broad/``, ``px4_plane/`` and ``drive_0708/`` as README.md describes them;
-``broad/`` may also hold the public ``data_mat/*.mat`` files of dlaidig/broad. Running it
-twice gives the same messages; the bytes of the files also depend on the version of zstd.
+``broad/`` may hold the public ``data_mat/*.mat`` files of dlaidig/broad instead, and
+``drive_0708/`` the files of that name of rtklibexplorer/GNSS_IMU. Running it twice gives the
+same messages; the bytes of the files also depend on the version of zstd.
 """
 
 import argparse
 import hashlib
 import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +20,11 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.estimation.acceleration_field_calibration import calibrate_array
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import (
-    fix_message, imu_message, mag_message, pose_message, velocity_message)
+    bool_message, fix_message, imu_message, mag_message, pose_message, velocity_message)
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 
 HERE = Path(__file__).resolve().parent
 IMU_FRAME = "imu_link"
@@ -30,12 +34,7 @@ WORLD_FRAME = "world"
 # BROAD gives a sampling rate and no stamps; its recordings start at this arbitrary instant.
 BROAD_EPOCH = 1_600_000_000_000_000_000
 
-IMU_TYPE = "sensor_msgs/msg/Imu"
-MAG_TYPE = "sensor_msgs/msg/MagneticField"
-FIX_TYPE = "sensor_msgs/msg/NavSatFix"
-VELOCITY_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
-POSE_TYPE = "geometry_msgs/msg/PoseStamped"
-BOOL_TYPE = "std_msgs/msg/Bool"
+STANDARD_GRAVITY = 9.80665
 
 # sensor_msgs/NavSatStatus
 STATUS_FIX, STATUS_GBAS_FIX = 0, 2
@@ -56,11 +55,6 @@ class Recording:
     attribution: str
     sources: tuple
     make: object
-
-
-def bool_message(value):
-    """CDR bytes of a std_msgs/Bool."""
-    return b"\x00\x01\x00\x00" + bytes([bool(value)])
 
 
 def read_broad(path):
@@ -88,11 +82,12 @@ def broad(trial):
         seen = np.isfinite(quat).all(axis=1)
         moving = data["mov"].astype(bool)
         change = np.flatnonzero(np.r_[True, moving[1:] != moving[:-1]])
-        yield "imu/data_raw", IMU_TYPE, [
+        yield "imu/data_raw", IMU.msgtype, [
             (t, imu_message(t, IMU_FRAME, gyr, acc))
             for t, gyr, acc in zip(stamp, data["gyr"].astype(float), data["acc"].astype(float))]
-        yield "imu/mag", MAG_TYPE, [(t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
-        yield "reference/pose", POSE_TYPE, [
+        yield "imu/mag", MAG.msgtype, [
+            (t, mag_message(t, IMU_FRAME, m)) for t, m in zip(stamp, mag)]
+        yield "reference/pose", POSE.msgtype, [
             (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp[seen], quat[seen])]
         yield "reference/moving", BOOL_TYPE, [
             (t, bool_message(m)) for t, m in zip(stamp[change], moving[change])]
@@ -128,17 +123,17 @@ def px4_plane(source):
     """Topics of the flight; the autopilot's own attitude is an estimate, not a reference."""
     folder = source / "px4_plane"
     stamp, imu = read_csv(folder / "imu.csv")
-    yield "imu/data_raw", IMU_TYPE, imu_rows(stamp, imu)
-    yield "imu/mag", MAG_TYPE, [(t, mag_message(t, IMU_FRAME, m)) for t, m in
+    yield "imu/data_raw", IMU.msgtype, imu_rows(stamp, imu)
+    yield "imu/mag", MAG.msgtype, [(t, mag_message(t, IMU_FRAME, m)) for t, m in
                                 zip(stamp, columns(imu, "mag_x", "mag_y", "mag_z"))]
     stamp, gnss = read_csv(folder / "gnss.csv")
-    yield "fix", FIX_TYPE, [
+    yield "fix", FIX.msgtype, [
         (t, fix_message(t, GNSS_FRAME, *position, status=STATUS_FIX))
         for t, position in zip(stamp, columns(gnss, "lat_deg", "lon_deg", "height_m"))]
-    yield "fix_velocity", VELOCITY_TYPE, velocity_rows(stamp, gnss)
+    yield "fix_velocity", TWIST.msgtype, velocity_rows(stamp, gnss)
     stamp, attitude = read_csv(folder / "onboard_attitude.csv")
     quat = enu_flu_from_euler(columns(attitude, "yaw_deg", "pitch_deg", "roll_deg"))
-    yield "onboard_ekf/pose", POSE_TYPE, [
+    yield "onboard_ekf/pose", POSE.msgtype, [
         (t, pose_message(t, WORLD_FRAME, q)) for t, q in zip(stamp, quat)]
 
 
@@ -153,19 +148,86 @@ def enu_flu_from_euler(yaw_pitch_roll_deg):
     return (ENU_NED * ned_frd * FLU_FRD.inv()).as_quat()
 
 
+def read_public_drive_imu(path):
+    """The drive's IMU from the public log, as :func:`read_csv` gives it from the CSV.
+
+    The log has no times but millisecond ticks; the ``.tag`` file beside it says when it began
+    and ended. The sensor is mounted with x and y backward and right. Its first and last line
+    are incomplete.
+    """
+    tag = path.with_name(path.name + ".tag").read_bytes()
+    whole, fraction = struct.unpack_from("<Id", tag, 64)
+    (duration_ms,) = struct.unpack_from("<I", tag, len(tag) - 8)
+    lines = path.read_text().splitlines()[1:-1]
+    values = np.array([line.split(",") for line in lines], dtype=np.float64)
+    ticks = values[:, 6] - values[0, 6]
+    since = ticks * (duration_ms * 1e-3 / ticks[-1])
+    stamp = whole * 1_000_000_000 + np.round((fraction + since) * 1e6).astype(np.int64) * 1000
+    turned = [-1.0, -1.0, 1.0]
+    acc = np.round(values[:, :3] * turned * STANDARD_GRAVITY, 5)
+    gyr = np.round(np.radians(values[:, 3:6] * turned), 6)
+    return stamp, dict(zip(("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"),
+                           np.hstack([acc, gyr]).T))
+
+
+def read_public_drive_gnss(path):
+    """The drive's GNSS from the public RTKLIB solution, as :func:`read_csv` gives it."""
+    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("%")]
+    stamp = np.array([f"{row[0].replace('/', '-')}T{row[1]}" for row in rows],
+                     dtype="datetime64[ns]").astype(np.int64)
+    values = np.array([row[2:] for row in rows], dtype=np.float64)
+    names = {"lat_deg": 0, "lon_deg": 1, "height_m": 2, "quality": 3, "sd_n": 5, "sd_e": 6,
+             "sd_u": 7, "vel_n": 13, "vel_e": 14, "vel_u": 15}
+    table = {name: values[:, column] for name, column in names.items()}
+    return stamp, {name: np.round(column, 4) if name.startswith("sd_") else column
+                   for name, column in table.items()}
+
+
 def drive(source):
     """Topics of the drive: the RTK positions with their stated standard deviations."""
     folder = source / "drive_0708"
-    stamp, imu = read_csv(folder / "imu.csv")
-    yield "imu/data_raw", IMU_TYPE, imu_rows(stamp, imu)
-    stamp, gnss = read_csv(folder / "gnss.csv")
+    if (folder / "imu.csv").exists():
+        (stamp, imu), gnss = read_csv(folder / "imu.csv"), read_csv(folder / "gnss.csv")
+    else:
+        stamp, imu = read_public_drive_imu(folder / "imu_1934.csv")
+        gnss = read_public_drive_gnss(folder / "gnss_1934_sf.pos")
+    yield "imu/data_raw", IMU.msgtype, imu_rows(stamp, imu)
+    stamp, gnss = gnss
     position = columns(gnss, "lat_deg", "lon_deg", "height_m")
     sd_enu = columns(gnss, "sd_e", "sd_n", "sd_u")
     status = np.where(gnss["quality"] == 1, STATUS_GBAS_FIX, STATUS_FIX)
-    yield "fix", FIX_TYPE, [
+    yield "fix", FIX.msgtype, [
         (t, fix_message(t, GNSS_FRAME, *p, cov_enu=np.diag(sd ** 2), status=s))
         for t, p, sd, s in zip(stamp, position, sd_enu, status)]
-    yield "fix_velocity", VELOCITY_TYPE, velocity_rows(stamp, gnss)
+    yield "fix_velocity", TWIST.msgtype, velocity_rows(stamp, gnss)
+
+
+# 60 s hold the whole rest at the start and most of the turning, in a few MB.
+MIMU_DURATION = 60.0
+MIMU_EPOCH = BROAD_EPOCH
+
+
+def mimu4444(source):
+    """Topics of a board of eight IMUs, turned by hand.
+
+    The accelerometers are calibrated from the static poses that come with the data and turned
+    into the axes of chip 0 (those of the board); ``imu/data_raw`` is the mean of the eight
+    gyroscopes and of the eight accelerometers.
+    """
+    data = np.load(source / "mimu4444" / "exp1_dynamic.npz")
+    keep = data["t"] < MIMU_DURATION
+    stamp = MIMU_EPOCH + np.round(data["t"][keep] * 1e9).astype(np.int64)
+    acc = calibrate_array(data["static_means_mps2"], STANDARD_GRAVITY).apply(
+        data["acc_counts"][keep] * float(data["acc_lsb_mps2"]))
+    gyr = np.radians(data["gyr_counts"][keep] * float(data["gyr_lsb_dps"]))
+    gyr = np.einsum("kij,nkj->nki", data["frame_R"].astype(float), gyr - data["gyro_bias_radps"])
+    # The 24 bits of mantissa that the calibration has; they compress better.
+    acc, gyr = (v.astype(np.float32).astype(np.float64) for v in (acc, gyr.mean(axis=1)))
+    yield "imu/data_raw", IMU.msgtype, [
+        (t, imu_message(t, IMU_FRAME, g, a)) for t, g, a in zip(stamp, gyr, acc.mean(axis=1))]
+    for k in range(acc.shape[1]):
+        yield f"accelerometers/imu{k}", IMU.msgtype, [
+            (t, imu_message(t, IMU_FRAME, None, a)) for t, a in zip(stamp, acc[:, k])]
 
 
 def _broad(name, trial, title):
@@ -196,6 +258,13 @@ RECORDINGS = {r.name: r for r in (
               "`data/drive_0708`", "BSD-3-Clause", "licenses/GNSS_IMU_BSD-3-Clause.txt",
               "Copyright (c) 2025, rtklibexplorer",
               ("drive_0708/imu.csv", "drive_0708/gnss.csv"), drive),
+    Recording("mimu4444", "board of eight IMUs, still, then turned by hand at up to 50 rad/s",
+              "[hcarlsso/Self-Calibration-Inertial-Sensor-Arrays-BCD.jl]"
+              "(https://github.com/hcarlsso/Self-Calibration-Inertial-Sensor-Arrays-BCD.jl), "
+              "experiment 1, first 60 s", "MIT", "licenses/mimu4444_MIT.txt",
+              "Copyright (c) 2021 Håkan Carlsson. Changed: units, calibration from the static poses, "
+              "axes of all chips turned into those of chip 0, gyroscopes averaged, format",
+              ("mimu4444/exp1_dynamic.npz",), mimu4444),
 )}
 
 

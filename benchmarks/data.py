@@ -4,7 +4,9 @@ import os
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from imu_fusion.estimation.orientation_error import split_angles
 from imu_fusion.samples.logs import ImuLog, MagLog
 
 
@@ -36,16 +38,9 @@ def load_broad(path):
 def broad_errors(quat, reference, mask):
     """BROAD's metric: RMSE in degrees of total, heading and inclination error.
 
-    quat, reference: (n, 4) xyzw. Heading 2 atan|z/w| and inclination
-    2 acos sqrt(w^2 + z^2) of the error quaternion in the world frame.
+    quat, reference: (n, 4) xyzw; mask: (n,) bool, the samples that count.
     """
     keep = mask & np.isfinite(reference).all(axis=1)
-    a, b = quat[keep], reference[keep] * [-1, -1, -1, 1]
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
-    z = a[:, 3] * b[:, 2] + a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] + a[:, 2] * b[:, 3]
-    w = a[:, 3] * b[:, 3] - a[:, 0] * b[:, 0] - a[:, 1] * b[:, 1] - a[:, 2] * b[:, 2]
-    heading = 2 * np.arctan2(np.abs(z), np.abs(w))
-    inclination = 2 * np.arccos(np.clip(np.hypot(w, z), 0, 1))
-    total = 2 * np.arccos(np.clip(np.abs(w), 0, 1))
-    return tuple(float(np.degrees(np.sqrt(np.mean(e ** 2))))
-                 for e in (total, heading, inclination))
+    error = Rotation.from_quat(quat[keep]) * Rotation.from_quat(reference[keep]).inv()
+    return tuple(float(np.degrees(np.sqrt(np.mean(angle ** 2))))
+                 for angle in split_angles(error.as_quat()))

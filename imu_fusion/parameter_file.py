@@ -48,29 +48,47 @@ def _walk(path, content, prefix=""):
             yield from _walk(path, body, f"{prefix}{key}/")
 
 
-def parameters_for(cls, node, path=None, **options):
+def parameters_for(classes, node, path=None, ignore=()):
     """The parameters of one node from a file, or its defaults without one.
 
     Args:
-        cls: a :class:`~imu_fusion.parameters.Parameters` class.
+        classes: the :class:`~imu_fusion.parameters.Parameters` classes of the node.
         node: node name; ``/**`` in the file applies to every node, with the names known to it.
         path: the file, or None.
-        options: passed to ``cls.from_mapping``.
+        ignore: names (or prefixes ending in a dot) that are read by somebody else.
+
+    Returns:
+        list of one object per class.
 
     Raises:
-        ParameterError: as ``cls.from_mapping``, naming the file.
+        ParameterError: unknown name, wrong type, value out of bounds; names the file.
     """
     if path is None:
-        return cls()
+        return [cls() for cls in classes]
+    known = {info.name for cls in classes for info in cls.infos()}
+    values = node_values(node, path, known)
+    result = []
+    for cls in classes:
+        own = {info.name for info in cls.infos()}
+        for info in cls.infos():
+            if info.path and values.get(info.name):
+                values[info.name] = resolve(values[info.name], path)
+        result.append(cls.from_mapping(values, source=str(path), ignore=(*ignore, *(known - own))))
+    return result
+
+
+def node_values(node, path, known):
+    """Names and values, dotted, that a file gives to a node: of ``/**`` only the known ones.
+
+    An empty dict without a file (path None).
+    """
+    if path is None:
+        return {}
     nodes = load(path)
-    known = {info.name for info in cls.infos()}
     values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
     values.update(flatten(nodes.get(node, {})))
     values.pop("use_sim_time", None)
-    for info in cls.infos():
-        if info.path and values.get(info.name):
-            values[info.name] = resolve(values[info.name], path)
-    return cls.from_mapping(values, source=str(path), **options)
+    return values
 
 
 def resolve(value, parameter_file):

@@ -4,6 +4,7 @@ import hashlib
 import importlib.util
 import json
 import os
+import struct
 from pathlib import Path
 
 import mcap.reader
@@ -53,6 +54,7 @@ def test_licences_are_those_of_the_sources():
     assert all("Attribution 4.0 International" in licence[name] for name in BROAD)
     assert "Paul Riseborough" in licence["px4_plane"]
     assert "rtklibexplorer" in licence["drive_0708"]
+    assert "Carlsson" in licence["mimu4444"]
 
 
 @pytest.mark.parametrize("name", MANIFEST)
@@ -106,7 +108,8 @@ def test_units_are_si(logs, name):
     assert norm[quiet].mean() == pytest.approx(9.81, rel=0.02)
     gyr = imu.gyr[quiet * window:(quiet + 1) * window]
     assert np.linalg.norm(gyr.mean(axis=0)) < np.radians(3)
-    assert np.abs(imu.gyr).max() < 40  # rad/s; in degrees it would exceed this
+    # rad/s; in degrees it would exceed this. The gyroscopes of mimu4444 clip at 34.9 rad/s.
+    assert np.abs(imu.gyr).max() < 40
     if "/imu/mag" in MANIFEST[name]["topics"]:
         field = np.linalg.norm(logs(name, "imu/mag").mag, axis=1)
         assert 20e-6 < np.median(field) < 70e-6
@@ -175,6 +178,14 @@ def test_gnss_velocity_is_the_rate_of_the_position(logs):
     assert set(np.unique(drive.status)) == {0, 2}
 
 
+def test_accelerometers_of_an_array_agree_while_it_is_still(logs):
+    accelerometers = [logs("mimu4444", f"accelerometers/imu{k}") for k in range(8)]
+    still = np.array([log.acc[:500].mean(axis=0) for log in accelerometers])
+    # Calibrated to 1 % of gravity, and in the same axes.
+    assert np.linalg.norm(still, axis=1) == pytest.approx(9.81, rel=0.01)
+    assert np.abs(still - still.mean(axis=0)).max() < 0.1
+
+
 @pytest.mark.skipif(not SOURCE.exists(), reason="the sources are not here (IMU_FUSION_DATA)")
 def test_making_a_recording_again_gives_the_same_messages(tmp_path):
     recording = make_bags.RECORDINGS["px4_plane"]
@@ -209,3 +220,46 @@ def test_the_public_mat_files_are_read_like_the_npz(tmp_path):
     assert from_mat.keys() == from_npz.keys()
     for key in from_npz:
         np.testing.assert_array_equal(from_mat[key], from_npz[key])
+
+
+def test_the_public_files_of_the_drive_are_read_like_the_csv(tmp_path, logs):
+    """The first lines of the public log and solution, against the recording made from the CSV.
+
+    The tag file is made here (a header of 60 bytes, tick, start in whole and fractional
+    seconds, then pairs of tick and position): it stretches the ticks by 1.0003, as the
+    stamps of the recording do.
+    """
+    (tmp_path / "imu_1934.csv").write_text(
+        "0.119,0.027,1.013,-0.671,3.082,0.198,261906\n"
+        "0.116,0.031,0.985,-0.359,0.946,0.168,261916\n"
+        "0.114,0.032,1.009,0.999,-3.815,0.191,261926\n"
+        "0.128,0.023,1.017,-0.526,1.640,0.031,261937\n"
+        "0.120,0.026,0.99")
+    duration_ms = 21.007
+    (tmp_path / "imu_1934.csv.tag").write_bytes(
+        b"TIMETAG".ljust(60, b"\0") + struct.pack("<IId", 5, 1752003261, 0.729)
+        + struct.pack("<II", 10, 40) + struct.pack("<II", round(duration_ms), 160))
+    stamp, table = make_bags.read_public_drive_imu(tmp_path / "imu_1934.csv")
+    imu = logs("drive_0708", "imu/data_raw")[:3]
+    # A tag in whole milliseconds moves a stamp by less than 10 us here.
+    assert np.abs(stamp - imu.stamp).max() < 10_000
+    for i, axis in enumerate("xyz"):
+        np.testing.assert_array_equal(table[f"acc_{axis}"], imu.acc[:, i])
+        np.testing.assert_array_equal(table[f"gyr_{axis}"], imu.gyr[:, i])
+
+    (tmp_path / "gnss_1934_sf.pos").write_text(
+        "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn sde sdu ...\n"
+        "2025/07/08 19:34:18.499 40.0966268 -105.1474483 1601.4740000 1.0000000 21.0000000 "
+        "0.0098995 0.0098995 0.0100000 0.0 0.0 0.0 0.0 0.0 0.0100000 -0.0020000 0.0090000 "
+        "0.0586899 0.0586899 0.0586899 0.0 0.0 0.0\n"
+        "2025/07/08 19:34:18.749 40.0966268 -105.1474483 1601.4760000 1.0000000 21.0000000 "
+        "0.0098995 0.0098995 0.0100000 0.0 0.0 0.0 0.0 0.0 0.0010000 0.0020000 -0.0060000 "
+        "0.0558614 0.0558614 0.0558614 0.0 0.0 0.0\n")
+    stamp, table = make_bags.read_public_drive_gnss(tmp_path / "gnss_1934_sf.pos")
+    fix, velocity = logs("drive_0708", "fix")[:2], logs("drive_0708", "fix_velocity")[:2]
+    np.testing.assert_array_equal(stamp, fix.stamp)
+    np.testing.assert_array_equal(table["lat_deg"], fix.latitude_deg)
+    np.testing.assert_array_equal(table["height_m"], fix.height)
+    np.testing.assert_allclose(table["sd_n"] ** 2, fix.cov_enu[:, 1, 1], rtol=1e-12)
+    for i, name in enumerate(("vel_e", "vel_n", "vel_u")):
+        np.testing.assert_array_equal(table[name], velocity.vel_world[:, i])

@@ -20,6 +20,11 @@ class Example(Parameters):
     surface: str = param("", path=True, doc="File.")
 
 
+@dataclass(frozen=True)
+class Other(Parameters):
+    speed: float = param(1.0, doc="Speed.")
+
+
 def test_values_are_converted_and_dotted_names_reach_their_fields():
     example = Example.from_mapping({"noise": 1, "limits": [1, 2, 3], "initial": {"mode": "given"}})
     assert example.noise == 1.0 and isinstance(example.noise, float)
@@ -60,13 +65,16 @@ def test_file_of_ros_parameters_with_wildcard_and_namespace(tmp_path):
     (tmp_path / "hill.yaml").touch()
     file = tmp_path / "p.yaml"
     file.write_text("/**:\n  ros__parameters:\n    noise: 0.5\n    somebody: 1\n    use_sim_time: true\n"
-                    "/robot/estimator:\n  ros__parameters:\n    count: 7\n    surface: hill.yaml\n"
+                    "/robot/estimator:\n  ros__parameters:\n    count: 7\n    speed: 2.0\n    surface: hill.yaml\n"
                     "other:\n  ros__parameters: {x: 1}\n")
-    example = parameters_for(Example, "estimator", file)
+    example, other = parameters_for([Example, Other], "estimator", file)
+    assert other.speed == 2.0
     assert (example.noise, example.count) == (0.5, 7)
     assert example.surface == str(tmp_path / "hill.yaml")
-    assert parameters_for(Example, "absent", file).count == 3
-    assert parameters_for(Example, "estimator") == Example()
+    assert parameters_for([Example], "absent", file)[0].count == 3
+    assert parameters_for([Example], "estimator") == [Example()]
+    with pytest.raises(ParameterError, match="unknown parameter 'speed'"):
+        parameters_for([Example], "estimator", file)
 
 
 @pytest.mark.parametrize("text, words", [
@@ -77,9 +85,9 @@ def test_bad_files_are_named(tmp_path, text, words):
     file = tmp_path / "p.yaml"
     file.write_text(text)
     with pytest.raises(ParameterError, match=words):
-        parameters_for(Example, "estimator", file)
+        parameters_for([Example], "estimator", file)
     with pytest.raises(ParameterError, match="nowhere.yaml"):
-        parameters_for(Example, "estimator", tmp_path / "nowhere.yaml")
+        parameters_for([Example], "estimator", tmp_path / "nowhere.yaml")
 
 
 def test_table_lists_every_parameter_with_unit_and_bounds():

@@ -18,7 +18,7 @@ FORBIDDEN = {"rclpy", "rosbags", "mcap", "plotly", "matplotlib", "yaml", "pathli
              "diagnostic_msgs"}
 # Rooms from the bottom up; a room imports only from rooms of a lower number.
 FLOOR = {"errors": 0, "parameters": 0, "geometry": 1, "samples": 1, "sensors": 2, "surfaces": 2,
-         "simulation": 2, "estimation": 3, "messages": 4, "parameter_file": 4,
+         "estimation": 3, "simulation": 3, "messages": 4, "parameter_file": 4,
          "surface_file": 4, "drivers": 5,
          "nodes": 5, "report": 5, "batch": 5, "graph": 5, "demos": 6, "cli": 7}
 

@@ -55,42 +55,47 @@ def detect_jump(imu, velocity):
     return JumpEvents(early, late - int(_LEAD * 1e9))
 
 
-def impact_onset(imu, touchdown, before=0.4, after=0.35):
+def impact_onset(imu, touchdown, search=0.4):
     """Stamp at which the force of the impact sets in, near a first guess.
 
-    The specific force in the air varies slowly; the impact is the first sample that leaves
-    its trend for good. Through it and its two successors runs a parabola, whose root dates
-    the onset, between the last quiet sample and the first loud one.
+    The magnitude of the specific force does not feel how the sensor turns, and in the air it
+    varies slowly. The impact is the last rise from that level to the largest peak nearby; a
+    parabola through its first three samples dates the onset by its root, between the last
+    quiet sample and the first loud one.
 
     Args:
         imu: ImuLog.
         touchdown: first guess, ns.
-        before, after: s searched around it.
+        search: s around it in which the peak lies.
 
     Returns:
         Stamp (ns) and its standard deviation (s), or None when nothing stands out.
     """
-    window = imu.between(touchdown - int(before * 1e9), touchdown + int(after * 1e9))
-    if len(window) < 12:
+    near = imu.between(touchdown - int(search * 1e9), touchdown + int(search * 1e9))
+    if len(near) < 3:
         return None
-    t = (window.stamp - window.stamp[0]) * 1e-9
-    peak = int(np.argmax(np.linalg.norm(window.acc, axis=1)))
-    quiet = max(int(0.4 * peak), 5)
-    trend = np.polynomial.polynomial.polyfit(t[:quiet], window.acc[:quiet], 1)
-    deviation = np.linalg.norm(
-        window.acc - np.polynomial.polynomial.polyval(t, trend).T, axis=1)
-    floor = max(np.median(deviation[:quiet]) * 6.0, 0.05 * deviation[peak])
-    loud = np.flatnonzero(deviation[:peak + 1] <= floor)
-    if not len(loud) or loud[-1] + 3 >= len(t):
+    peak_stamp = near.stamp[np.argmax(np.linalg.norm(near.acc, axis=1))]
+    # The quiet level: the air before the rise, which takes less than 0.1 s (Fang: 0.05 s).
+    window = imu.between(peak_stamp - 300_000_000, peak_stamp + 50_000_000)
+    t = (window.stamp - peak_stamp) * 1e-9
+    quiet = t < -0.1
+    if quiet.sum() < 5:
         return None
-    i = int(loud[-1]) + 1
+    force = np.linalg.norm(window.acc, axis=1)
+    level = np.median(force[quiet])
+    rise = force - level
+    peak = int(np.searchsorted(t, 0.0))
+    floor = max(6.0 * np.median(np.abs(rise[quiet])), 0.1 * rise[peak])
+    below = np.flatnonzero(rise[:peak + 1] <= floor)
+    if not len(below) or rise[peak] <= 3.0 * floor or below[-1] + 3 >= len(t):
+        return None
+    i = int(below[-1]) + 1
     step = t[i] - t[i - 1]
-    curve = np.polynomial.Polynomial.fit(t[i:i + 3], deviation[i:i + 3], 2).convert()
-    roots = curve.roots()
+    roots = np.polynomial.Polynomial.fit(t[i:i + 3], rise[i:i + 3], 2).convert().roots()
     roots = roots[np.isreal(roots)].real
     roots = roots[roots <= t[i]]
     onset = np.clip(roots.max() if len(roots) else t[i] - 0.5 * step, t[i - 1], t[i])
-    return int(window.stamp[0] + round(onset * 1e9)), step / np.sqrt(12.0)
+    return int(peak_stamp + round(onset * 1e9)), step / np.sqrt(12.0)
 
 
 def _interpolate(stamp, samples, name):

@@ -168,6 +168,17 @@ class OrientationEstimator:
         self._new_chunk()
         self.reset()
 
+    def set_params(self, params):
+        """Go on with other parameters from the next sample on.
+
+        Raises:
+            ParameterError: another method or mode, which have another state.
+        """
+        if (params.method, params.mode) != (self.params.method, self.params.mode):
+            raise ParameterError("parameters 'method' and 'mode' cannot change while running: "
+                                 "start another estimator")
+        self.params, self._par = params, self._pack(params)
+
     def reset(self):
         """Forget all samples: the next ones start a new alignment."""
         self._x = np.zeros(self._kernel.X_SIZE)

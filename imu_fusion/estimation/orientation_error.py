@@ -148,11 +148,8 @@ def orientation_errors(stamp, quat_world_imu, reference, cov_attitude=None, max_
         rotation_world[known] = error.as_rotvec()
         angles[known] = np.column_stack(split_angles(error.as_quat()))
         if cov_attitude is not None:
-            cov = np.asarray(cov_attitude, dtype=np.float64)[known]
-            # The error in the world is -R times the local one: same covariance, turned.
-            matrix = estimate.as_matrix()
-            cov_world = matrix @ cov @ matrix.transpose(0, 2, 1)
-            usable = _positive_definite(cov_world)
+            cov_world = attitude_cov_world(quat[known], np.asarray(cov_attitude)[known])
+            usable = np.isfinite(cov_world).all(axis=(1, 2))
             rows = np.flatnonzero(known)[usable]
             cov_world = cov_world[usable]
             sd_world[rows] = np.sqrt(np.diagonal(cov_world, axis1=1, axis2=2))
@@ -161,6 +158,26 @@ def orientation_errors(stamp, quat_world_imu, reference, cov_attitude=None, max_
     return OrientationErrors(stamp=stamp, rotation_world=rotation_world, sd_world=sd_world,
                              total=angles[:, 0], heading=angles[:, 1],
                              inclination=angles[:, 2], nees=nees)
+
+
+def attitude_cov_world(quat_world_imu, cov_attitude):
+    """Attitude covariances about the axes of the world, NaN where they are unknown.
+
+    The error in the world is minus the local one, turned by the estimate: same covariance,
+    turned.
+
+    Args:
+        quat_world_imu: (n, 4) xyzw.
+        cov_attitude: (n, 3, 3) rad^2 of the local error.
+
+    Returns:
+        (n, 3, 3) rad^2 about east, north and up; NaN where ``cov_attitude`` is not positive
+        definite (zeros, -1 and NaN mean unknown).
+    """
+    matrix = Rotation.from_quat(quat_world_imu).as_matrix()
+    cov_world = matrix @ np.asarray(cov_attitude, dtype=np.float64) @ matrix.transpose(0, 2, 1)
+    cov_world[~_positive_definite(cov_world)] = np.nan
+    return cov_world
 
 
 def split_angles(quat_error_world):

@@ -1,4 +1,4 @@
-"""Normal gravity of WGS84, closed form, and its vector in a local frame."""
+"""Normal gravity of WGS84, closed form; gravity and Earth rotation in a local frame."""
 
 import numpy as np
 from numba import njit
@@ -10,6 +10,8 @@ _E2 = _F * (2.0 - _F)
 _GAMMA_EQUATOR = 9.7803253359
 _K = 0.00193185265241
 _M = 0.00344978650684
+
+_EARTH_RATE = 7.292115e-5  # rad/s, ibid. table 3.1
 
 #: Mean radius of the ellipsoid, m.
 MEAN_RADIUS = 6371008.8
@@ -30,6 +32,12 @@ def normal_gravity(latitude_deg, height):
     surface = _GAMMA_EQUATOR * (1.0 + _K * s2) / np.sqrt(1.0 - _E2 * s2)
     h = height / _A
     return surface * (1.0 - 2.0 * (1.0 + _F + _M - 2.0 * _F * s2) * h + 3.0 * h * h)
+
+
+def earth_rate_world(latitude_deg):
+    """Rotation of the Earth (3,) in rad/s, east-north-up."""
+    latitude = np.radians(latitude_deg)
+    return _EARTH_RATE * np.array([0.0, np.cos(latitude), np.sin(latitude)])
 
 
 @njit(cache=True)

@@ -332,7 +332,7 @@ class BagWriter:
                 if not self.directory.is_dir():
                     raise BagError(f"{self.directory}: is a file, not a directory to record into")
                 present = sorted(p.name for p in self.directory.iterdir())
-                ours = all(p == "metadata.yaml" or p.endswith((".mcap", ".db3")) for p in present)
+                ours = all(p == "metadata.yaml" or p.endswith((".mcap", ".db3", ".json")) for p in present)
                 if present and not (overwrite and ours):
                     raise BagError(f"{self.directory}: exists and is not empty; choose another "
                                    "directory" + ("" if ours else " (it holds other files)"))

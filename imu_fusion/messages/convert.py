@@ -8,12 +8,15 @@ about the fixed axes of the world, as geometry_msgs/PoseWithCovariance words it;
 estimators keep it about the axes of the sensor.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
 from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
-from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3
+from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
 from imu_fusion.samples import (AttitudeLog, FixLog, ImuLog, MagLog, PoseLog,
                                 VelocityLog)
 
@@ -113,47 +116,67 @@ def mag_values(values):
     return values[..., MAG["magnetic_field"]]
 
 
-def _frame(frames, default):
-    return frames[0] if frames else default
+def fix_values(values):
+    """Latitude, longitude, height, covariance row by row, status (..., 13) of NavSatFix values."""
+    return np.concatenate([values[..., 2:5], values[..., FIX["position_covariance"]],
+                           values[..., :1]], axis=-1)
 
 
-def _covariance(values, field):
-    return values[:, field].reshape(-1, 3, 3)
+def velocity_values(values):
+    """Velocity, covariance row by row (..., 12) of TwistWithCovarianceStamped values."""
+    cov = values[..., TWIST["covariance"]].reshape(*values.shape[:-1], 6, 6)[..., :3, :3]
+    return np.concatenate([values[..., TWIST["linear"]], cov.reshape(*values.shape[:-1], 9)],
+                          axis=-1)
 
 
-def imu_log(messages):
-    """ImuLog of a list of CDR sensor_msgs/Imu, in the order given."""
-    stamp, frames, values = IMU.decode_many(messages)
-    samples = imu_values(values)
-    return ImuLog(stamp, samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
+def pose_values(values):
+    """Orientation, position (..., 7) of PoseStamped values."""
+    return np.concatenate([values[..., POSE["orientation"]], values[..., POSE["position"]]],
+                          axis=-1)
 
 
-def mag_log(messages):
-    """MagLog of a list of CDR sensor_msgs/MagneticField."""
-    stamp, frames, values = MAG.decode_many(messages)
-    return MagLog(stamp, mag_values(values), _frame(frames, "imu_link"))
+def _imu_log(stamp, samples, frame_id):
+    return ImuLog(stamp, samples[:, :3], samples[:, 3:], frame_id)
 
 
-def fix_log(messages):
-    """FixLog of a list of CDR sensor_msgs/NavSatFix."""
-    stamp, frames, values = FIX.decode_many(messages)
-    return FixLog(stamp, values[:, 2], values[:, 3], values[:, 4],
-                  _covariance(values, FIX["position_covariance"]), values[:, 0],
-                  _frame(frames, "gnss"))
+def _fix_log(stamp, samples, frame_id):
+    return FixLog(stamp, samples[:, 0], samples[:, 1], samples[:, 2],
+                  samples[:, 3:12].reshape(-1, 3, 3), samples[:, 12], frame_id)
 
 
-def velocity_log(messages):
-    """VelocityLog of a list of CDR geometry_msgs/TwistWithCovarianceStamped."""
-    stamp, frames, values = TWIST.decode_many(messages)
-    cov = values[:, TWIST["covariance"]].reshape(-1, 6, 6)[:, :3, :3]
-    return VelocityLog(stamp, values[:, TWIST["linear"]], cov, _frame(frames, "world"))
+def _velocity_log(stamp, samples, frame_id):
+    return VelocityLog(stamp, samples[:, :3], samples[:, 3:].reshape(-1, 3, 3), frame_id)
 
 
-def pose_log(messages):
-    """PoseLog of a list of CDR geometry_msgs/PoseStamped."""
-    stamp, frames, values = POSE.decode_many(messages)
-    return PoseLog(stamp, values[:, POSE["orientation"]], values[:, POSE["position"]],
-                   _frame(frames, "world"))
+def _pose_log(stamp, samples, frame_id):
+    return PoseLog(stamp, samples[:, :4], samples[:, 4:], frame_id)
+
+
+@dataclass(frozen=True)
+class SampleType:
+    """How one message type becomes samples.
+
+    ``values`` picks them from the decoded numbers, (size,) -> (width,) or
+    (n, size) -> (n, width); ``log`` makes the typed log of stamps (n,), samples
+    (n, width) and a frame id.
+    """
+
+    layout: Layout
+    width: int
+    values: Callable
+    log: Callable
+
+    def read(self, messages):
+        """The log of a list of CDR messages, in the order given; the frame of the first."""
+        stamp, frames, values = self.layout.decode_many(messages)
+        return self.log(stamp, self.values(values), frames[0] if frames else "")
+
+
+SAMPLE_TYPES = {kind.layout.msgtype: kind for kind in (
+    SampleType(IMU, 6, imu_values, _imu_log), SampleType(MAG, 3, mag_values, MagLog),
+    SampleType(FIX, 13, fix_values, _fix_log),
+    SampleType(TWIST, 12, velocity_values, _velocity_log),
+    SampleType(POSE, 7, pose_values, _pose_log))}
 
 
 def attitude_log(messages):
@@ -163,19 +186,20 @@ def attitude_log(messages):
         TopicError: the messages say that they carry no orientation.
     """
     stamp, frames, values = IMU.decode_many(messages)
-    cov_world = _covariance(values, IMU["orientation_covariance"])
+    cov_world = values[:, IMU["orientation_covariance"]].reshape(-1, 3, 3)
     if (cov_world[:, 0, 0] == -1.0).any():
         raise TopicError("these sensor_msgs/Imu carry no orientation (covariance[0] is -1): they "
                          "are raw data, not estimates")
     quat = values[:, IMU["orientation"]]
-    rotation = Rotation.from_quat(quat).as_matrix() if len(quat) else np.empty((0, 3, 3))
+    # Zeros: a source that left them unset. Such an orientation is not a number.
+    known = (np.linalg.norm(quat, axis=1) > 0.5)[:, None]
+    rotation = np.empty((0, 3, 3))
+    if len(quat):
+        rotation = Rotation.from_quat(np.where(known, quat, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+    quat = np.where(known, quat, np.nan)
     samples = imu_values(values)
     return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,
-                       samples[:, :3], samples[:, 3:], _frame(frames, "imu_link"))
-
-
-LOGS = {IMU.msgtype: imu_log, MAG.msgtype: mag_log, FIX.msgtype: fix_log,
-        TWIST.msgtype: velocity_log, POSE.msgtype: pose_log}
+                       samples[:, :3], samples[:, 3:], frames[0] if frames else "")
 
 
 def read_log(reader, topic, log_of=None):
@@ -184,7 +208,7 @@ def read_log(reader, topic, log_of=None):
     Args:
         reader: what :func:`imu_fusion.messages.bag.open_bag` returned.
         topic: name, with or without leading slash.
-        log_of: function of a list of messages, if not the one of the type in LOGS
+        log_of: function of a list of messages, if not the one of its type
             (such as :func:`attitude_log`).
 
     Raises:
@@ -192,8 +216,8 @@ def read_log(reader, topic, log_of=None):
         MessageError: bytes that do not fit the type.
     """
     info = reader.require(topic)
-    log_of = log_of or LOGS.get(info.msgtype)
-    if log_of is None:
+    if log_of is None and info.msgtype not in SAMPLE_TYPES:
         raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
-                         f"logs exist for {', '.join(sorted(LOGS))}")
+                         f"logs exist for {', '.join(sorted(SAMPLE_TYPES))}")
+    log_of = log_of or SAMPLE_TYPES[info.msgtype].read
     return log_of([cdr for *_, cdr in reader.messages([info.name])])

@@ -1,12 +1,12 @@
 """What is in a recording, topic by topic: rates, gaps, ranges, and what looks wrong."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from imu_fusion.errors import MessageError
-from imu_fusion.messages.convert import LOGS, read_log
+from imu_fusion.messages.convert import SAMPLE_TYPES, read_log
 from imu_fusion.messages.layouts import NANOSECONDS
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 
@@ -25,15 +25,21 @@ class Range:
 
 @dataclass(frozen=True)
 class TopicReport:
-    """One topic: ``timing`` of its header stamps (log times, if it is not ``stamped`` because
-    its messages have no header), ``ranges`` of what it measures, ``findings`` about it."""
+    """One topic: ``stamp`` (n,) int64 ns of its headers (log times, if it is not ``stamped``
+    because its messages have no header) and their ``timing``, ``ranges`` of what it measures,
+    ``findings`` about it, and its ``log`` if there is one for its type."""
 
     topic: str
     msgtype: str
-    timing: checks.Timing
-    ranges: tuple
-    findings: tuple
+    stamp: np.ndarray = field(repr=False, compare=False)
+    ranges: tuple = ()
+    findings: tuple = ()
     stamped: bool = True
+    log: object = field(default=None, repr=False, compare=False)
+    timing: checks.Timing = field(init=False)
+
+    def __post_init__(self):
+        object.__setattr__(self, "timing", checks.timing(self.stamp))
 
     @property
     def count(self):
@@ -43,12 +49,15 @@ class TopicReport:
     @property
     def rate(self):
         """Mean rate in Hz, None with fewer than two stamps or without a header."""
-        return None if not self.stamped or np.isnan(self.timing.rate_hz) else self.timing.rate_hz
+        return self._or_none(self.timing.rate_hz)
 
     @property
     def longest_gap(self):
         """Longest interval in s, None with fewer than two stamps or without a header."""
-        return None if not self.stamped or np.isnan(self.timing.longest_gap_s) else self.timing.longest_gap_s
+        return self._or_none(self.timing.longest_gap_s)
+
+    def _or_none(self, value):
+        return None if not self.stamped or np.isnan(value) else value
 
     @property
     def notes(self):
@@ -65,20 +74,19 @@ def inspect_topics(reader):
     Returns:
         list of TopicReport, in order of their names.
     """
-    logs, reports = {}, []
+    reports = []
     for name, info in sorted(reader.topics.items()):
-        if info.msgtype in LOGS and info.count:
+        if info.msgtype in SAMPLE_TYPES and info.count:
             try:
-                logs[name] = read_log(reader, name)
+                report = inspect_log(name, info.msgtype, read_log(reader, name))
             except MessageError as error:
-                reports.append(TopicReport(name, info.msgtype, checks.timing([]), (), (
-                    checks.Finding("type", f"{name}: {error}"),)))
-                continue
-            report = inspect_log(name, info.msgtype, logs[name])
+                report = TopicReport(name, info.msgtype, np.empty(0, np.int64), (), (
+                    checks.Finding("type", f"{name}: {error}"),))
         else:
             report = _inspect_stamps(reader, name, info)
         reports.append(report)
-    return [_with_axes(report, logs) for report in reports]
+    imus = [report.log for report in reports if isinstance(report.log, ImuLog)]
+    return [_with_axes(report, imus) for report in reports]
 
 
 def inspect_log(name, msgtype, log):
@@ -104,19 +112,16 @@ def inspect_log(name, msgtype, log):
         ranges = ()
         if isinstance(log, PoseLog):
             findings += checks.check_finite(log.quat_world_imu, name, "orientation")
-            ranges = (_range("|quaternion|", "", _norm(log.quat_world_imu)),)
-    return TopicReport(name, msgtype, checks.timing(log.stamp),
-                       tuple(r for r in ranges if r is not None), tuple(findings))
+    return TopicReport(name, msgtype, log.stamp, (r for r in ranges if r is not None),
+                       tuple(findings), log=log)
 
 
-def _with_axes(report, logs):
+def _with_axes(report, imus):
     """Add how a magnetometer turns against the only Imu of the recording."""
-    imus = [log for log in logs.values() if isinstance(log, ImuLog)]
-    log = logs.get(report.topic)
-    if not isinstance(log, MagLog) or len(imus) != 1:
+    if not isinstance(report.log, MagLog) or len(imus) != 1:
         return report
-    findings = (*report.findings, *checks.check_axes(imus[0], log, report.topic))
-    return TopicReport(report.topic, report.msgtype, report.timing, report.ranges, findings)
+    return replace(report, findings=(*report.findings,
+                                     *checks.check_axes(imus[0], report.log, report.topic)))
 
 
 def _inspect_stamps(reader, name, info):
@@ -130,9 +135,10 @@ def _inspect_stamps(reader, name, info):
             stamps.append(sec * NANOSECONDS + nanosec)
         else:
             stamps.append(log_time)
+    stamps = np.array(stamps, dtype=np.int64)
     # Without a header, messages may be sent at any time: gaps mean nothing.
     findings = checks.check_stamps(stamps, name) if stamped else []
-    return TopicReport(name, info.msgtype, checks.timing(stamps), (), tuple(findings), stamped)
+    return TopicReport(name, info.msgtype, stamps, (), tuple(findings), stamped)
 
 
 def _norm(vectors):

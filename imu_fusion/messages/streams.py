@@ -6,9 +6,23 @@ adds recordings.
 """
 
 from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
 
 from imu_fusion.errors import MessageError
+from imu_fusion.parameters import Parameters, param
 from imu_fusion.samples.merge import RESTART, SampleStream
+
+
+@dataclass(frozen=True)
+class EstimatorNodeParams(Parameters):
+    """What concerns a node, not its estimate."""
+
+    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
+                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
+                         "for repeats of what was lost (replay).")
+
 
 _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
 
@@ -17,14 +31,15 @@ class Stream:
     """Messages of several topics to an estimator; a stage of a flow Relay.
 
     Args:
-        inputs: dict of topic to (Layout, function of decoded values to the sample's
-            array), in order of rank at equal stamps.
+        inputs: dict of topic to SampleType, in order of rank at equal stamps.
         emit: called as ``emit(topic, stamp, cdr)`` with every message made.
         warn: called with a text when something is wrong with the input.
 
-    Subclasses implement ``restart`` (forget everything), ``take`` (one sample),
+    Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement ``restart`` (forget everything), ``take`` (one sample),
     ``flush`` (emit what is held back) and ``look_at`` (texts about first samples).
     """
+
+    same_frame = ()
 
     def __init__(self, inputs, emit, warn=lambda text: None):
         self.inputs = inputs
@@ -45,9 +60,9 @@ class Stream:
 
     def push(self, topic, cdr):
         """Take the bytes of one message; what may happen now is queued for :meth:`step`."""
-        layout, to_sample = self.inputs[topic]
+        kind = self.inputs[topic]
         try:
-            stamp, frame_id, values = layout.decode(cdr)
+            stamp, frame_id, values = kind.layout.decode(cdr)
         except MessageError as error:
             self.bad_messages += 1
             self.warn(f"{topic}: message left out: {error}")
@@ -55,11 +70,11 @@ class Stream:
         if topic not in self.frame_ids:
             self.frame_ids[topic] = frame_id
             self._compare_frames()
-        sample = to_sample(values)
+        sample = kind.values(values)
         if len(self._first[topic]) < _LOOK_AT:
             self._first[topic].append((stamp, sample))
             if len(self._first[topic]) == _LOOK_AT:
-                for text in self.look_at(topic, self._first):
+                for text in self.look_at(topic, self._first_logs()):
                     self.warn(text)
         self._queue.extend(self.merged.add(topic, stamp, sample))
 
@@ -95,9 +110,18 @@ class Stream:
     def flush(self):
         raise NotImplementedError
 
-    def look_at(self, topic, first):
-        """Texts about the first samples of ``topic``; ``first`` maps topics to (stamp, sample)."""
+    def look_at(self, topic, logs):
+        """Texts about the first samples of ``topic``; ``logs`` maps topics to what there is."""
         return []
+
+    def _first_logs(self):
+        logs = {}
+        for topic, rows in self._first.items():
+            if rows:
+                stamps, samples = zip(*rows)
+                logs[topic] = self.inputs[topic].log(np.array(stamps), np.array(samples),
+                                                     self.frame_ids[topic])
+        return logs
 
     def _refused(self, topic, stamp, verdict):
         count = self.merged.guards[topic].counts[verdict]
@@ -106,6 +130,7 @@ class Stream:
                       f"({count} so far)")
 
     def _compare_frames(self):
-        if len(set(self.frame_ids.values())) > 1:
-            named = ", ".join(f"{topic} in '{frame}'" for topic, frame in self.frame_ids.items())
+        frames = {t: f for t, f in self.frame_ids.items() if t in self.same_frame}
+        if len(set(frames.values())) > 1:
+            named = ", ".join(f"{topic} in '{frame}'" for topic, frame in frames.items())
             self.warn(f"sensors name different frames ({named}): their axes are taken as parallel")

@@ -3,7 +3,6 @@
 import importlib
 import signal
 import sys
-import time
 
 import rclpy
 import rclpy.node
@@ -15,6 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+from imu_fusion.nodes.flow import steady_timer
 
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
@@ -62,12 +62,14 @@ def descriptor(info):
 class Node(rclpy.node.Node):
     """Base of our nodes.
 
-    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses.
-    Unknown parameters, wrong types and values out of bounds raise ParameterError.
+    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses, and
+    ``OPEN_PREFIXES``: parameters below these need not be known, ``open_parameters`` holds them.
+    Other unknown parameters, wrong types and values out of bounds raise ParameterError.
     """
 
     NAME = ""
     PARAMETERS = ()
+    OPEN_PREFIXES = ()
 
     def __init__(self, **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
@@ -104,7 +106,7 @@ class Node(rclpy.node.Node):
             array.header.stamp = self.get_clock().now().to_msg()
             self._diagnostics.publish(array)
 
-        self.create_timer(1.0, publish)
+        steady_timer(self, 1.0, publish)
 
     def _declare(self):
         # rclpy has declared what was given, with the type that it was given in. Take it
@@ -116,6 +118,10 @@ class Node(rclpy.node.Node):
                 given[name] = value.tolist() if hasattr(value, "tolist") else value
                 self.undeclare_parameter(name)
         known = {info.name: info for cls in self.PARAMETERS for info in cls.infos()}
+        self.open_parameters = {name: given.pop(name) for name in list(given)
+                                if name not in known and name.startswith(self.OPEN_PREFIXES)}
+        for name, value in self.open_parameters.items():
+            self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
@@ -141,30 +147,24 @@ class Node(rclpy.node.Node):
         return values
 
     def _on_set_parameters(self, parameters):
+        changed = dict(self._params)
         for parameter in parameters:
             for cls in self.PARAMETERS:
-                for info in cls.infos():
-                    if info.name == parameter.name:
-                        try:
-                            self._params[cls] = self._params[cls].replace(
-                                **{info.name.replace(".", "__"): parameter.value})
-                        except ParameterError as error:
-                            return SetParametersResult(successful=False, reason=str(error))
+                if any(info.name == parameter.name for info in cls.infos()):
+                    try:
+                        changed[cls] = changed[cls].replace(
+                            **{parameter.name.replace(".", "__"): parameter.value})
+                    except ParameterError as error:
+                        return SetParametersResult(successful=False, reason=str(error))
+        try:
+            self.apply(changed)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self._params = changed
         return SetParametersResult(successful=True)
 
-
-def spin(executor, nodes, until, timeout):
-    """Run ``nodes`` until ``until()`` is true or ``timeout`` seconds have passed; for tests.
-
-    Returns:
-        Whether ``until()`` became true.
-    """
-    deadline = time.monotonic() + timeout
-    while not until():
-        if time.monotonic() > deadline:
-            return False
-        executor.spin_once(timeout_sec=min(node.work() for node in nodes))
-    return True
+    def apply(self, params):
+        """Parameters are about to change to ``params`` (class to object); may refuse."""
 
 
 def run_node(node_class, args=None):

@@ -1,22 +1,11 @@
 """What the nodes of all streaming estimators share: a Stream between DDS topics."""
 
-from dataclasses import dataclass
-
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
-from imu_fusion.parameters import Parameters, param
 from imu_fusion.samples.guard import Verdict
-
-
-@dataclass(frozen=True)
-class EstimatorNodeParams(Parameters):
-    """What concerns the node, not the estimate."""
-
-    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
-                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
-                         "for repeats of what was lost (replay).")
 
 
 class EstimatorNode(Node):
@@ -31,8 +20,8 @@ class EstimatorNode(Node):
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()
         self._names = {}  # resolved name -> ours
-        for topic, (layout, _) in stream.inputs.items():
-            inbox = self._relay.subscribe(message_class(layout.msgtype), topic,
+        for topic, kind in stream.inputs.items():
+            inbox = self._relay.subscribe(message_class(kind.layout.msgtype), topic,
                                           lambda cdr, _, topic=topic: stream.push(topic, cdr), qos)
             self._names[inbox.topic] = topic
         self.start_diagnostics(self._status)

@@ -10,7 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from imu_fusion.errors import BagError, ParameterError, TopicError
 from imu_fusion.messages.bag import BagWriter, qos_profile
 from imu_fusion.nodes.base import Node, message_class, run_node
-from imu_fusion.nodes.flow import DEPTH, NEXT, FlowSink
+from imu_fusion.nodes.flow import DEPTH, NEXT, FlowSink, steady_timer
 from imu_fusion.parameters import Parameters, param
 
 
@@ -74,8 +74,10 @@ class Recorder(Node):
         self._writer = BagWriter(p.out, compression=p.compression, chunk_size=p.chunk_size,
                                  overwrite=p.overwrite)
         self._failed = False
-        self._flow = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end)
-        self.create_timer(0.2, self._discover)
+        # Under use_sim_time nothing is asked for before there is a time to record it at.
+        self._flow = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end,
+                              hold=lambda: self._sim_time and not self._now())
+        steady_timer(self, 0.2, self._discover)
         self.start_diagnostics(lambda: (b"\0", "recording", dict(self._writer.counts)))
 
     def close(self):
@@ -108,12 +110,12 @@ class Recorder(Node):
             self._subscribe(topic, [msgtype])
 
     def _on_end(self, session):
-        if session.event != NEXT and not self._flow.sessions and self._p.end_with_sources:
+        if session.event != NEXT and not self._flow.feeding() and self._p.end_with_sources:
             self.finished = True
 
     def _discover(self):
         for topic, msgtypes in self.get_topic_names_and_types():
-            if self.count_publishers(topic):
+            if topic not in self._flow.inboxes and self.count_publishers(topic):
                 self._subscribe(topic, msgtypes)
 
     def _subscribe(self, topic, msgtypes):
@@ -138,9 +140,11 @@ class Recorder(Node):
 
         self._flow.subscribe(cls, topic, store, adapted_qos(infos))
 
+    def _now(self):
+        return self.get_clock().now().nanoseconds
+
     def _write(self, topic, msgtype, cdr, info):
-        received = (self.get_clock().now().nanoseconds if self._sim_time
-                    else info["received_timestamp"] or time.time_ns())
+        received = self._now() if self._sim_time else info["received_timestamp"] or time.time_ns()
         try:
             self._writer.write(topic, msgtype, cdr, received, info["source_timestamp"] or received)
         except BagError:

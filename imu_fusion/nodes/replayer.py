@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import ParameterError, TopicError
 from imu_fusion.messages.bag import find_topic, open_bag
 from imu_fusion.nodes.base import Node, message_class, run_node
-from imu_fusion.nodes.flow import DEPTH, END, NEXT, FlowSource, reliable_qos
+from imu_fusion.nodes.flow import DEPTH, END, NEXT, FlowSource, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress
 from imu_fusion.parameters import Parameters, param
 
@@ -88,12 +88,12 @@ class Replayer(Node):
         self._steps = 0
         self._pace = 1.0
         self._anchor = None  # (monotonic time, log time) from which the pace counts
-        self._told = ""
+        self._told, self._told_at = "", 0
         self._progress = Progress("replaying", (self._stop - self._start) * 1e-9)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/resume", self._on_resume)
         self.create_service(Trigger, "~/step", self._on_step)
-        self.create_timer(1.0, self._tell)
+        steady_timer(self, 1.0, self._tell)
         self.start_diagnostics(lambda: (b"\0", self._phase.__name__.strip("_"), {
             publisher.topic: publisher.sent for publisher in self._outputs.values()}))
 
@@ -171,6 +171,9 @@ class Replayer(Node):
 
     def _join(self):
         """All our nodes on the graph must have answered."""
+        if self._clock_out is not None and self._next is not None:
+            self._publish_clock(self._next[1])
+            self._next_clock = 0
         if not self._source.ready():
             self._give_up_after(self.params(ReplayerParams).wait_timeout,
                                 self._source.waiting_for())
@@ -255,13 +258,13 @@ class Replayer(Node):
                              "see wait_for_subscribers, wait_for_nodes and wait_timeout")
 
     def _tell(self):
-        """Say, once each, what holds the replay up or slows it down."""
+        """Say, once each, what has held the replay up since the last look, or slows it down."""
         p = self.params(ReplayerParams)
+        sent = sum(publisher.sent for publisher in self._outputs.values())
         text = ""
         if self._phase == self._wait:
             text = "waiting for subscribers"
-        elif self._phase in (self._join, self._drain) or (
-                self._phase == self._play and not self._source.ready()):
+        elif self._phase != self._play or (sent == self._told_at and not self._source.ready()):
             text = self._source.waiting_for()
         elif p.rate == 0.0 and self._source.foreign and p.foreign_rate:
             names = sorted({n for names in self._source.foreign.values() for n in names})
@@ -269,7 +272,7 @@ class Replayer(Node):
                     f"cannot acknowledge subscribe: {', '.join(names)}")
         if text and text != self._told:
             self.get_logger().info(text)
-        self._told = text
+        self._told, self._told_at = text, sent
 
     def _on_pause(self, request, response):
         self._paused = True

@@ -11,29 +11,32 @@ def decimate(time, values, points=POINTS):
 
     Args:
         time: (n,) increasing.
-        values: (n,), NaN where there is nothing; a stretch of NaN stays a break in the line.
+        values: (n,), NaN where a line shall break.
         points: what comes back has at most this many.
 
     Returns:
-        (time, values): a subset of the samples.
+        (time, values): a subset of the samples, with one NaN wherever some are left out.
     """
     time, values = np.asarray(time), np.asarray(values)
     n = len(values)
     if n <= points:
         return time, values
-    length = -(-n // (points // 2))
+    length = -(-n // (points // 3))
     bins = -(-n // length)
     padded = np.full(bins * length, np.nan)
     padded[:n] = values
     blocks = padded.reshape(bins, length)
     absent = np.isnan(blocks)
-    empty = absent.all(axis=1)
     low = np.argmin(np.where(absent, np.inf, blocks), axis=1)
     high = np.argmax(np.where(absent, -np.inf, blocks), axis=1)
-    pair = np.sort(np.column_stack([low, high]), axis=1) + np.arange(bins)[:, None] * length
-    # A stretch of NaN has one point: that is enough to break the line.
-    pair[empty, 1] = pair[empty, 0]
-    index = np.unique(pair)
+    pair = np.column_stack([low, high]) + np.arange(bins)[:, None] * length
+    index = np.unique(pair[~absent.all(axis=1)])
+    holes = np.flatnonzero(np.isnan(values))
+    if len(holes) and len(index):
+        # The first hole after each kept sample breaks the line to the next one.
+        after = np.searchsorted(holes, index)
+        after = holes[after[after < len(holes)]]
+        index = np.unique(np.concatenate([index, after]))
     return time[index], values[index]
 
 

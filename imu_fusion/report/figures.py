@@ -23,7 +23,7 @@ HIGHLIGHT = "#D55E00"
 SECONDARY = "#CC79A7"
 NEUTRAL = "#7b8794"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7b8794")
-_INK, _GRID = "#39444f", "#e8ecf1"
+_INK, _GRID, _AXIS = "#39444f", "#e8ecf1", "#c5ced8"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,8 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """An area between ``low`` and ``high`` (n,)."""
+    """An area between ``low`` and ``high`` (n,), left out where it is wider than ``widest`` or
+    jumps by more: what wraps around or is not determined has no band."""
 
     name: str
     time: np.ndarray
@@ -49,15 +50,17 @@ class Band:
     high: np.ndarray
     color: str = BAND
     opacity: float = 0.35
+    widest: float = np.inf
 
 
 @dataclass(frozen=True)
 class Panel:
-    """What stands over one vertical axis; ``label`` names quantity and unit."""
+    """What stands over one vertical axis; ``label`` names quantity and unit, ``title`` (text
+    from outside) stands in the lower left corner."""
 
     label: str
     items: tuple
-    log: bool = False
+    title: str = ""
     from_zero: bool = False
 
 
@@ -82,29 +85,42 @@ def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
         for item in panel.items:
             for trace in _traces(item, named):
                 figure.add_trace(trace, row=row, col=1)
-        figure.update_yaxes(type="log" if panel.log else "linear",
-                            rangemode="tozero" if panel.from_zero else "normal", row=row, col=1)
+        figure.update_yaxes(rangemode="tozero" if panel.from_zero else "normal", row=row, col=1)
         # Axis titles would stand at a distance that depends on their tick labels.
         figure.add_annotation(text=panel.label, textangle=-90, showarrow=False, xref="paper", x=0,
                               xshift=-62, yref=f"y{row if row > 1 else ''} domain", y=0.5,
                               xanchor="center", yanchor="middle", font=dict(size=13))
+        if panel.title:
+            figure.add_annotation(text=plain(panel.title), showarrow=False, xref="paper", x=0,
+                                  xshift=6, yref=f"y{row if row > 1 else ''} domain", y=0.04,
+                                  xanchor="left", yanchor="bottom", font=dict(size=12),
+                                  bgcolor="rgba(255,255,255,0.75)")
     if len(shaded):
         _shade(figure, shaded, shaded_name)
+    style(figure, height=int(95 + panel_height * len(panels)))
     figure.update_layout(
-        height=int(95 + panel_height * len(panels)),
-        margin=dict(l=84, r=18, t=52, b=48), template="none", hovermode="x unified",
-        font=dict(family="system-ui, Segoe UI, Roboto, Helvetica, Arial, sans-serif", size=13,
-                  color=_INK),
-        legend=dict(orientation="h", x=0, xanchor="left", y=1, yref="container", yanchor="top",
-                    font=dict(size=13), itemsizing="constant"),
-        hoverlabel=dict(font=dict(size=12)))
-    figure.update_xaxes(gridcolor=_GRID, zeroline=False, linecolor="#c5ced8", showline=True,
-                        ticks="outside", tickcolor="#c5ced8", hoverformat=".3f", matches="x")
-    figure.update_yaxes(gridcolor=_GRID, zerolinecolor="#c5ced8", zerolinewidth=1,
-                        linecolor="#c5ced8", showline=True, nticks=6)
+        hovermode="x unified", hoverlabel=dict(font=dict(size=12)),
+        # Above the panels, at the same distance in pixels however many there are.
+        legend=dict(orientation="h", x=0, xanchor="left", yanchor="bottom",
+                    y=1 + 12 / (panel_height * len(panels) - 5), font=dict(size=13),
+                    itemsizing="constant"))
+    figure.update_xaxes(zeroline=False, hoverformat=".3f", matches="x")
+    figure.update_yaxes(nticks=6)
     figure.update_xaxes(title=dict(text="time since start in s", font=dict(size=13), standoff=6),
                         row=len(panels), col=1)
     return figure
+
+
+def style(figure, height):
+    """Fonts, margins, grid and axes that all figures share. height: pixels."""
+    figure.update_layout(
+        height=height, margin=dict(l=84, r=18, t=52, b=48), template="none",
+        font=dict(family="system-ui, Segoe UI, Roboto, Helvetica, Arial, sans-serif", size=13,
+                  color=_INK))
+    line = dict(gridcolor=_GRID, linecolor=_AXIS, showline=True, zerolinecolor=_AXIS,
+                zerolinewidth=1, title_font=dict(size=13))
+    figure.update_xaxes(ticks="outside", tickcolor=_AXIS, **line)
+    figure.update_yaxes(**line)
 
 
 def intervals(time, mask):
@@ -121,25 +137,53 @@ def break_wraps(angle_deg):
     return result
 
 
+def break_gaps(time, values):
+    """A signal with NaN put into its gaps: intervals of more than ten usual ones."""
+    step = np.diff(time)
+    if len(step) == 0:
+        return time, values
+    gaps = np.flatnonzero(step > 10 * np.median(step)) + 1
+    if len(gaps) == 0:
+        return time, values
+    return (np.insert(np.asarray(time, dtype=np.float64), gaps, time[gaps - 1]),
+            np.insert(np.asarray(values, dtype=np.float64), gaps, np.nan))
+
+
 def _traces(item, named):
     first = item.name not in named
     named.add(item.name)
     common = dict(name=plain(item.name), legendgroup=item.name, showlegend=first)
     if isinstance(item, Band):
-        time, low, high = envelope(item.time, item.low, item.high)
-        if len(time) == 0:
+        x, y = _outline(*envelope(item.time, item.low, item.high), item.widest)
+        if len(x) == 0:
             return []
         red, green, blue = (int(item.color[i:i + 2], 16) for i in (1, 3, 5))
         return [go.Scatter(
-            x=_compact(np.concatenate([time, time[::-1]])),
-            y=_compact(np.concatenate([high, low[::-1]])), mode="lines", line=dict(width=0),
+            x=_compact(x), y=_compact(y), mode="lines", line=dict(width=0),
             fill="toself", fillcolor=f"rgba({red},{green},{blue},{item.opacity})",
             hoverinfo="skip", **common)]
-    time, values = decimate(item.time, item.values)
+    time, values = decimate(*break_gaps(item.time, item.values))
     return [go.Scatter(
         x=_compact(time), y=_compact(values), mode="markers" if item.markers else "lines",
         line=dict(color=item.color, width=item.width, dash=item.dash, simplify=False),
         marker=dict(color=item.color, size=4), hovertemplate="%{y:.4g}", **common)]
+
+
+def _outline(time, low, high, widest):
+    """(x, y) of the outlines around a band, one for each stretch, with NaN between them."""
+    keep = high - low <= widest
+    time, low, high = time[keep], low[keep], high[keep]
+    if len(time) < 2:
+        return time[:0], low[:0]
+    step = np.diff(time)
+    jump = np.abs(np.diff(low + high)) / 2
+    breaks = np.flatnonzero((step > 10 * np.median(step)) | (jump > widest)) + 1
+    x, y = [], []
+    for part in np.split(np.arange(len(time)), breaks):
+        back = part[::-1]
+        x += [time[part], time[back], [np.nan]]
+        y += [high[part], low[back], [np.nan]]
+    return np.concatenate(x), np.concatenate(y)
 
 
 def _shade(figure, shaded, name):

@@ -47,30 +47,71 @@ def euler_zyx(quat_world_imu, cov_attitude=None):
     return angles, np.minimum(sd, np.pi)
 
 
-def orientation_section(stamp, quat_world_imu, cov_attitude, origin, reference=None,
-                        reference_name="reference", shaded=()):
-    """Section with roll, pitch and yaw of an estimate beside a reference.
+def angle_panels(estimate, origin, reference=None, reference_name="reference"):
+    """Panels of roll, pitch and yaw with their band, beside a reference.
 
     Args:
-        stamp: (n,) int64 ns; quat_world_imu: (n, 4) xyzw; cov_attitude: (n, 3, 3) or None.
+        estimate: AttitudeLog.
         origin: int ns, zero of the time axis.
         reference: PoseLog or None.
-        shaded: [(start, end)] s in movement.
     """
-    time = seconds(stamp, origin)
-    angles, sd = (np.degrees(a) for a in euler_zyx(quat_world_imu, cov_attitude))
-    if reference is not None and len(reference):
+    time = seconds(estimate.stamp, origin)
+    angles, sd = (np.degrees(a) for a in euler_zyx(estimate.quat_world_imu,
+                                                   estimate.cov_attitude))
+    has_reference = reference is not None and len(reference) > 0
+    if has_reference:
         known = np.isfinite(reference.quat_world_imu).all(axis=1)
         ref_time = seconds(reference.stamp[known], origin)
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
     panels = []
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i])]
-        items.append(Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE))
-        if reference is not None and len(reference):
+        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i],
+                      widest=180.0),
+                 Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE)]
+        if has_reference:
             items.append(Line(reference_name, ref_time, fig.break_wraps(ref_angles[:, i]),
                               fig.REFERENCE, dash="dot", width=1.2))
         panels.append(Panel(f"{name} in °", tuple(items)))
+    return panels
+
+
+def error_panels(errors, origin, word="error"):
+    """Panels of the error rotation in world axes with the stated standard deviations.
+
+    Args:
+        errors: OrientationErrors.
+        origin: int ns, zero of the time axis.
+        word: what it is called in the legend.
+    """
+    time = seconds(errors.stamp, origin)
+    panels = []
+    for i, name in enumerate(("tilt about east", "tilt about north", "heading")):
+        sd = np.degrees(errors.sd_world[:, i])
+        panels.append(Panel(f"{name} in °", (
+            Band("±3σ stated", time, -3 * sd, 3 * sd, opacity=0.18),
+            Band("±1σ stated", time, -sd, sd, opacity=0.38),
+            Line(word, time, np.degrees(errors.rotation_world[:, i]), fig.ESTIMATE))))
+    return panels
+
+
+def orientation_section(estimate, origin, reference=None, reference_name="reference", shaded=()):
+    """Section with roll, pitch and yaw of an estimate beside a reference.
+
+    Args:
+        estimate, origin, reference: see :func:`angle_panels`.
+        shaded: [(start, end)] s in movement.
+    """
+    panels = angle_panels(estimate, origin, reference, reference_name)
+    cov_world = orientation_error.attitude_cov_world(estimate.quat_world_imu,
+                                                     estimate.cov_attitude)
+    time = seconds(estimate.stamp, origin)
+    variance = np.diagonal(cov_world, axis1=1, axis2=2)
+    stated = [("tilt", np.sqrt(variance[:, 0] + variance[:, 1]), fig.ESTIMATE),
+              ("heading", np.sqrt(variance[:, 2]), fig.HIGHLIGHT)]
+    if np.isfinite(variance).any():
+        panels.append(Panel("σ stated in °", tuple(
+            Line(f"σ of {name}", time, np.degrees(sd), color) for name, sd, color in stated),
+            from_zero=True))
     return Section("Orientation", (
         Figure(time_figure(panels, shaded, _MOVING),
                "Roll, pitch and yaw of the sensor in east-north-up (REP 103: yaw counter-clockwise "
@@ -78,14 +119,17 @@ def orientation_section(stamp, quat_world_imu, cov_attitude, origin, reference=N
                "errors are judged below without angles that can do that."),))
 
 
-def error_section(errors, origin, moving=None, reference_name="reference", shaded=()):
+def error_section(errors, origin, moving=None, reference_name="reference", is_truth=True,
+                  shaded=()):
     """Section with the errors against a reference and their statistics.
 
     Args:
         errors: OrientationErrors.
         origin: int ns, zero of the time axis.
         moving: (n,) bool, or None.
+        is_truth: whether the reference is so much better that differences are errors.
     """
+    word = "error" if is_truth else "difference"
     time = seconds(errors.stamp, origin)
     rows = []
     for label, mask in ((_MOVING, moving), ("all samples", None)):
@@ -94,23 +138,19 @@ def error_section(errors, origin, moving=None, reference_name="reference", shade
         for row in orientation_error.statistics(errors, mask):
             rows.append((label, row.name, number(row.rmse_deg, 2), number(row.median_deg, 2),
                          number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count))
-    table = Table(("samples", "error angle", "RMSE °", "median °", "95 % below °", "largest °",
+    table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
-                  f"Error against {reference_name}. The error rotation (estimate times inverse "
-                  "reference, in the world) is split as in BROAD (Laidig et al. 2021) into a "
-                  "heading part about the vertical and an inclination part about a horizontal "
-                  "axis.")
-    blocks = [table, *_honesty(errors, moving)]
-    panels = []
-    for i, name in enumerate(("tilt about east", "tilt about north", "heading")):
-        sd = np.degrees(errors.sd_world[:, i])
-        panels.append(Panel(f"{name} in °", (
-            Band("±3σ stated", time, -3 * sd, 3 * sd, opacity=0.18),
-            Band("±1σ stated", time, -sd, sd, opacity=0.38),
-            Line("error", time, np.degrees(errors.rotation_world[:, i]), fig.ESTIMATE))))
+                  f"{word.capitalize()}s relative to {reference_name}. The {word} rotation "
+                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig et "
+                  "al. 2021) into a heading part about the vertical and an inclination part about a "
+                  "horizontal axis.")
+    blocks = [table]
+    if is_truth:
+        blocks += _honesty(errors, moving)
+    panels = error_panels(errors, origin, word)
     blocks.append(Figure(
         time_figure(panels, shaded, _MOVING),
-        "The error rotation in the axes of the world with the standard deviations that the "
+        f"The {word} rotation in the axes of the world with the standard deviations that the "
         "estimator stated."))
     variance = errors.sd_world ** 2
     panels = []
@@ -119,13 +159,14 @@ def error_section(errors, origin, moving=None, reference_name="reference", shade
         panels.append(Panel(f"{name} in °", (
             Band("3σ stated", time, 0 * expected, 3 * expected, opacity=0.18),
             Band("1σ stated", time, 0 * expected, expected, opacity=0.38),
-            Line("error angle", time, np.degrees(getattr(errors, name)), fig.ESTIMATE)),
+            Line(f"{word} angle", time, np.degrees(getattr(errors, name)), fig.ESTIMATE)),
             from_zero=True))
     blocks.append(Figure(
         time_figure(panels, shaded, _MOVING, panel_height=160),
-        "The error angles of the table; σ is the root of the sum of the variances involved, that "
-        "is the RMS that the estimator expected."))
-    return Section("Error against the reference", tuple(blocks))
+        f"The {word} angles of the table; σ is the root of the sum of the variances involved, "
+        "that is the RMS that the estimator expected."))
+    return Section("Error against the reference" if is_truth
+                   else f"Difference from {reference_name}", tuple(blocks))
 
 
 def _honesty(errors, moving):
@@ -174,8 +215,9 @@ def field_section(stamp, mag_world, origin, shaded=()):
         Table(("quantity", "unit", "median", "5 %", "95 %", "standard deviation"), tuple(rows)),
         Figure(time_figure(panels, shaded, _MOVING),
                "What the magnetometer measured, turned into the world by the estimated "
-               "orientation. In an undisturbed field all three stand still; the strength does not "
-               "depend on the orientation, the direction holds its heading error too.")))
+               "orientation. In an undisturbed field all three stand still. The strength does not "
+               "depend on the orientation; inclination and direction do, and an estimator that "
+               "steers by the field keeps them still.")))
 
 
 def motion_section(raw, corrected, origin, shaded=()):
@@ -205,21 +247,22 @@ def motion_section(raw, corrected, origin, shaded=()):
         Figure(time_figure(panels, shaded, _MOVING), " ".join(caption)),))
 
 
-def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0):
+def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0, is_truth=True):
     """The numbers at the top of a report."""
     items = [Number("Duration", f"{duration_s:.1f} s"),
              Number("Imu", f"{number(imu_rate_hz, 1)} Hz", "mean rate")]
     if errors is not None:
-        where = _MOVING if moving is not None else "of all samples"
+        where = "moving" if moving is not None else "all samples"
+        word = "error" if is_truth else "difference"
         for row in orientation_error.statistics(errors, moving):
-            items.append(Number(f"{row.name.capitalize()} error", f"{number(row.rmse_deg, 2)}°",
-                                f"RMSE {where}"))
-        shares = orientation_error.shares_within(errors, moving)
+            items.append(Number(f"{row.name.capitalize()} {word}", f"{number(row.rmse_deg, 2)}°",
+                                f"RMS, {where}"))
+        shares = orientation_error.shares_within(errors, moving) if is_truth else {}
         for name, values in shares.items():
             if np.isfinite(values[0]):
-                items.append(Number(f"{name.capitalize()} within 3σ", f"{100 * values[2]:.1f} %",
+                items.append(Number(f"{name.capitalize()} ≤ 3σ", f"{100 * values[2]:.1f} %",
                                     "Gaussian: 99.7 %"))
-    items.append(Number("Remarks", str(findings), "on stamps, units, ranges"))
+    items.append(Number("Remarks", str(findings), "on stamps, units"))
     return Numbers(tuple(items))
 
 

@@ -1,6 +1,7 @@
 """The report of a recording: what it holds, and how good the orientation made from it is."""
 
 import datetime
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,68 @@ from imu_fusion.estimation.orientation_error import moving_at, orientation_error
 from imu_fusion.messages.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
-from imu_fusion.messages.layouts import BOOL_TYPE, IMU, MAG, POSE
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.report.figures import intervals
-from imu_fusion.report.html import Section, Text, write_report
+from imu_fusion.report.gnss import gnss_section
+from imu_fusion.report.html import Notes, Section, Text, write_report
 from imu_fusion.report.orientation import (
     error_section, field_section, key_numbers, motion_section, orientation_section)
 from imu_fusion.report.overview import overview_section
+from imu_fusion.samples import seconds
+from imu_fusion.samples.guard import guard_log
 
 RAW, MAGNETOMETER, ESTIMATES = "imu/data_raw", "imu/mag", "imu/data"
+FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
 REFERENCE, MOVING = "reference/pose", "reference/moving"
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What a report needs of a recording; None where it has no such topic."""
+
+    topics: list
+    logs: dict
+    reference_name: str | None
+    changes: tuple | None
+    warnings: tuple
+    start: int
+    duration_s: float
+
+    def log(self, topic):
+        """The log of a topic, or None."""
+        return self.logs.get(topic)
+
+
+def read_contents(path):
+    """Read a recording for a report.
+
+    Raises:
+        BagError, TopicError: it cannot be read, or holds no messages.
+    """
+    with open_bag(path) as reader:
+        topics = inspect_topics(reader)
+        if not any(t.count for t in topics):
+            raise TopicError(f"{path}: no messages to report about")
+        found = {t.topic.lstrip("/"): t for t in topics if t.log is not None and t.count}
+        poses = [name for name, t in found.items() if t.msgtype == POSE.msgtype]
+        reference_name = REFERENCE if REFERENCE in poses else next(iter(poses), None)
+        wanted = {RAW: IMU, MAGNETOMETER: MAG, FIX_TOPIC: FIX, VELOCITY_TOPIC: TWIST}
+        if reference_name:
+            wanted[reference_name] = POSE
+        warnings = list(reader.warnings)
+        logs = {name: _usable(found[name].log, name, warnings) for name, layout in wanted.items()
+                if name in found and found[name].msgtype == layout.msgtype}
+        return Contents(topics, logs, reference_name, moving_changes(reader), tuple(warnings),
+                        reader.start_time, (reader.end_time - reader.start_time) * 1e-9)
+
+
+def read_estimates(path):
+    """(AttitudeLog of imu/data or None, warnings) of a recording."""
+    warnings = []
+    with open_bag(path) as reader:
+        if not _has(reader, ESTIMATES, IMU.msgtype):
+            return None, warnings
+        return _usable(read_log(reader, ESTIMATES, attitude_log), ESTIMATES, warnings), warnings
 
 
 def write_orientation_report(bag, estimates, path):
@@ -36,59 +90,57 @@ def write_orientation_report(bag, estimates, path):
         BagError, TopicError: a recording cannot be read, or holds nothing to report about.
         ImuFusionError: the file cannot be written.
     """
-    with open_bag(bag) as reader:
-        topics = inspect_topics(reader)
-        logs = {name: read_log(reader, name) for name, msgtype in
-                ((RAW, IMU.msgtype), (MAGNETOMETER, MAG.msgtype)) if _has(reader, name, msgtype)}
-        reference_name = _reference(reader)
-        reference = read_log(reader, reference_name) if reference_name else None
-        changes = _moving(reader)
-        warnings = list(reader.warnings)
-        start = reader.start_time
-        duration = (reader.end_time - start) * 1e-9
-    with open_bag(estimates) as reader:
-        estimate = None
-        if _has(reader, ESTIMATES, IMU.msgtype):
-            estimate = read_log(reader, ESTIMATES, attitude_log)
-    if not topics:
-        raise TopicError(f"{bag}: no topics to report about")
-
-    raw, mag = logs.get(RAW), logs.get(MAGNETOMETER)
-    stamps = {t.topic: log.stamp for name, log in logs.items()
-              for t in topics if t.topic.lstrip("/") == name}
-    clock = raw if raw is not None else estimate
-    origin = int(clock.stamp[0]) if clock is not None and len(clock) else start
+    contents = read_contents(bag)
+    estimate, warnings = read_estimates(estimates)
+    warnings = [*contents.warnings, *warnings]
+    raw, mag = contents.log(RAW), contents.log(MAGNETOMETER)
+    reference = contents.log(contents.reference_name)
+    is_truth = contents.reference_name == REFERENCE
+    clock = next((log for log in (raw, estimate, contents.log(FIX_TOPIC))
+                  if log is not None and len(log)), None)
+    origin = contents.start if clock is None else int(clock.stamp[0])
     errors = moving = None
     shaded = ()
-    if changes is not None and clock is not None:
-        shaded = intervals((clock.stamp - origin) * 1e-9, moving_at(clock.stamp, *changes))
+    if contents.changes is not None and clock is not None:
+        shaded = intervals(seconds(clock.stamp, origin),
+                           moving_at(clock.stamp, *contents.changes))
     if estimate is not None and reference is not None:
         errors = orientation_errors(estimate.stamp, estimate.quat_world_imu, reference,
                                     estimate.cov_attitude)
-        moving = None if changes is None else moving_at(estimate.stamp, *changes)
+        if contents.changes is not None:
+            moving = moving_at(estimate.stamp, *contents.changes)
 
-    rate = next((t.rate for t in topics if t.topic.lstrip("/") == RAW), None)
-    findings = sum(len(t.findings) for t in topics) + len(warnings)
-    blocks = [key_numbers(duration, np.nan if rate is None else rate, errors, moving, findings)]
-    blocks += [Text(warning) for warning in warnings]
+    rate = next((t.rate for t in contents.topics if t.topic.lstrip("/") == RAW), None)
+    findings = sum(len(t.findings) for t in contents.topics) + len(warnings)
+    blocks = [key_numbers(contents.duration_s, np.nan if rate is None else rate, errors, moving,
+                          findings, is_truth)]
+    if warnings:
+        blocks.append(Notes(tuple(warnings)))
     if estimate is None:
         blocks.append(Text(f"{Path(estimates).name} holds no estimates on {ESTIMATES}: this "
                            "report is about the recording alone. imu_fusion process makes them."))
-    sections = [Section("Summary", tuple(blocks)), overview_section(topics, stamps, origin)]
+    elif errors is not None:
+        blocks.append(Text(f"Orientation from {estimates} against {contents.reference_name} of "
+                           "the recording" + ("." if is_truth else ", which is somebody's "
+                                              "estimate too: what follows are differences, not "
+                                              "errors.")))
+    sections = [Section("Summary", tuple(blocks)), overview_section(contents.topics, origin)]
     if estimate is not None:
-        sections.append(orientation_section(
-            estimate.stamp, estimate.quat_world_imu, estimate.cov_attitude, origin, reference,
-            reference_name or "", shaded))
+        sections.append(orientation_section(estimate, origin, reference,
+                                            contents.reference_name or "", shaded))
     if errors is not None:
-        sections.append(error_section(errors, origin, moving, reference_name, shaded))
-    if estimate is not None and mag is not None and len(mag):
+        sections.append(error_section(errors, origin, moving, contents.reference_name, is_truth,
+                                      shaded))
+    if estimate is not None and mag is not None:
         sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
     if raw is not None or estimate is not None:
-        sections.append(motion_section(
-            raw, estimate, origin, shaded))
-    date = datetime.datetime.fromtimestamp(start * 1e-9, datetime.timezone.utc)
-    write_report(path, f"{Path(bag).resolve().name}", sections,
-                 f"{Path(bag)}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
+        sections.append(motion_section(raw, estimate, origin, shaded))
+    if FIX_TOPIC in contents.logs:
+        sections.append(gnss_section(contents.log(FIX_TOPIC), contents.log(VELOCITY_TOPIC),
+                                     origin))
+    date = datetime.datetime.fromtimestamp(contents.start * 1e-9, datetime.timezone.utc)
+    write_report(path, Path(bag).resolve().name, sections,
+                 f"{bag}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
 
 
 def carry(mag, estimate):
@@ -110,21 +162,30 @@ def carry(mag, estimate):
     return result
 
 
+def _usable(log, name, warnings):
+    """The samples of a log that can be drawn: what the guard lets pass, with unit quaternions,
+    up to where the clock was set back."""
+    if hasattr(log, "quat_world_imu"):
+        absent = np.linalg.norm(log.quat_world_imu, axis=1) < 0.5
+        if absent.any():
+            warnings.append(f"{name}: {absent.sum()} orientations are zero and left out")
+            log = log[~absent]
+    log, epochs, guard = guard_log(log)
+    for reason, count in guard.refused().items():
+        warnings.append(f"{name}: {count} samples left out: {reason}")
+    if len(epochs) and epochs[-1] > 0:
+        warnings.append(f"{name}: the clock was set back; only what comes before is shown")
+        log = log[epochs == 0]
+    return log
+
+
 def _has(reader, topic, msgtype):
     name = find_topic(reader.topics, topic)
     return name is not None and reader.topics[name].msgtype == msgtype \
         and bool(reader.topics[name].count)
 
 
-def _reference(reader):
-    """The topic to compare with: the reference, else the first other pose, else None."""
-    if _has(reader, REFERENCE, POSE.msgtype):
-        return REFERENCE
-    poses = sorted(t.name for t in reader.topics.values() if t.msgtype == POSE.msgtype and t.count)
-    return poses[0] if poses else None
-
-
-def _moving(reader):
+def moving_changes(reader):
     """(stamps, values) of the movement mask's changes, or None."""
     if not _has(reader, MOVING, BOOL_TYPE):
         return None

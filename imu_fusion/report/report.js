@@ -21,8 +21,14 @@ function follow(source, event) {
     .finally(() => { following = false; });
 }
 
+// Arrays come as base64 of float32: {"dtype": "f4", "bdata": ...}.
+function decode(key, value) {
+  if (value === null || value.dtype !== "f4") return value;
+  return new Float32Array(Uint8Array.from(atob(value.bdata), (c) => c.charCodeAt(0)).buffer);
+}
+
 for (const element of document.querySelectorAll(".plot")) {
-  const figure = JSON.parse(element.nextElementSibling.textContent);
+  const figure = JSON.parse(element.nextElementSibling.textContent, decode);
   Plotly.newPlot(element, figure.data, figure.layout, plotConfig).then((plot) => {
     if (!plot.classList.contains("linked")) return;
     plots.push(plot);

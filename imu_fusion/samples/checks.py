@@ -245,7 +245,8 @@ def check_axes(imu, mag, name):
 
     The direction b of a constant field obeys ``db/dt = b x w`` in sensor axes (Winkler 2025,
     eq. B.3). The slope of the measured on the predicted change is 1; degrees per second give
-    pi/180, a gyroscope of opposite sign or other axes something else.
+    pi/180, a gyroscope of opposite sign or other axes something else. Both are summed over
+    blocks of a tenth of a second, in which the field turns by more than the magnetometer's noise.
     """
     if len(imu) < 3 or len(mag) < 3:
         return []
@@ -255,14 +256,20 @@ def check_axes(imu, mag, name):
         direction = mag.mag / norm[:, None]
     middle = seconds(mag.stamp[:-1], imu.stamp[0]) + 0.5 * step
     time = seconds(imu.stamp, imu.stamp[0])
-    if np.any(np.diff(time) <= 0):
+    if np.any(np.diff(time) <= 0) or np.median(step) <= 0:
         return []  # check_stamps has said so
     gyr = np.column_stack([np.interp(middle, time, imu.gyr[:, i], left=np.nan, right=np.nan)
                            for i in range(3)])
     predicted = np.cross(0.5 * (direction[1:] + direction[:-1]), gyr) * step[:, None]
     measured = np.diff(direction, axis=0)
-    usable = (np.isfinite(predicted).all(axis=1) & np.isfinite(measured).all(axis=1)
-              & (step > 0) & (step < 0.2))
+    unusable = (step <= 0) | (step > 0.2)
+    predicted[unusable] = np.nan
+    length = max(int(round(0.1 / np.median(step))), 1)
+    blocks = len(step) // length
+    predicted, measured = (
+        change[:blocks * length].reshape(blocks, length, 3).sum(axis=1)
+        for change in (predicted, measured))
+    usable = np.isfinite(predicted).all(axis=1) & np.isfinite(measured).all(axis=1)
     predicted, measured = predicted[usable].ravel(), measured[usable].ravel()
     if not predicted.any() or not measured.any():
         return []

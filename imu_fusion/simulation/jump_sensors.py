@@ -70,7 +70,7 @@ def record(jump, rng, phone=PhoneErrors(), gnss=GnssErrors(), gnss_rate=10.0, ep
     biases = [sd * rng.standard_normal(3) for sd in (
         phone.gyr_bias_sd, phone.acc_bias_sd, phone.mag_bias_sd, phone.mag_scale_sd)]
     gyr_bias, acc_bias, mag_bias, mag_scale = biases
-    gyr = motion.omega_imu + gyr_bias + phone.gyr_sd * rng.standard_normal((n, 3))
+    gyr = jump.rate(motion) + gyr_bias + phone.gyr_sd * rng.standard_normal((n, 3))
     if phone.gyr_range > 0.0:
         gyr = np.clip(gyr, -phone.gyr_range, phone.gyr_range)
     acc = jump.specific_force(motion) + acc_bias + phone.acc_sd * rng.standard_normal((n, 3))

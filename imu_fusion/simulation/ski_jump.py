@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.geometry.gravity import gravity_world, normal_gravity
+from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
 from imu_fusion.parameters import Parameters, param
 from imu_fusion.surfaces.hill import Hill
 
@@ -24,7 +24,7 @@ class JumpParams(Parameters):
     """How somebody jumps."""
 
     start_x: float = param(-78.0, doc="Start, hill frame", unit="m", high=-10)
-    rest: float = param(2.0, doc="Rest at the start", unit="s", low=0.5)
+    rest: float = param(5.0, doc="Time on the bar before the start", unit="s", low=0.5)
     friction: float = param(0.02, doc="Friction coefficient of the skis", low=0, high=0.2)
     drag_in_run: float = param(0.0011, doc="Drag over mass in the in-run", unit="1/m", low=0)
     drag: float = param(0.0038, doc="Drag over mass in flight", unit="1/m", low=0)
@@ -94,9 +94,10 @@ class SkiJump:
         slope = hill.landing(x)[1]
         self._sink_speed = vz - slope * vx
         self.x_touchdown, self.length = x, hill.jump_length(x)
-        brake_x = brentq(lambda x: hill.landing(x)[1] - 0.1, x, x + 200.0)
+        # Braking begins where the transition has become flat.
+        self._brake_x = brentq(lambda x: hill.landing(x)[1] - 0.1, x, x + 200.0)
         end = max(params.duration, self.t_touchdown) + 1.0
-        self._out = solve_ivp(self._ground(hill.landing, params.drag, brake_x),
+        self._out = solve_ivp(self._ground(hill.landing, params.drag, self._brake_x),
                               (self.t_touchdown, end), [x, vx * np.hypot(1.0, slope)],
                               **options).sol
 
@@ -157,19 +158,20 @@ class SkiJump:
                  (t >= self.t_takeoff) & (t < self.t_touchdown), t >= self.t_touchdown]
         pos[:, masks[0]] = np.array([[p.start_x], [float(hill.in_run(p.start_x)[0])]])
         m = masks[1]
-        pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
-            t[m], self._run(t[m]), self._ground(hill.in_run, p.drag_in_run, None), hill.in_run,
-            self._push(t[m]))
+        if m.any():
+            pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
+                t[m], self._run(t[m]), self._ground(hill.in_run, p.drag_in_run, None),
+                hill.in_run, self._push(t[m]))
         m = masks[2]
-        y = self._air(t[m])
-        pos[:, m], vel[:, m] = y[:2], y[2:]
-        acc[:, m] = np.array([self._flight(0.0, yi)[2:] for yi in y.T]).reshape(-1, 2).T
+        if m.any():
+            y = self._air(t[m])
+            pos[:, m], vel[:, m] = y[:2], y[2:]
+            acc[:, m] = np.array([self._flight(0.0, yi)[2:] for yi in y.T]).T
         m = masks[3]
-        brake_x = brentq(lambda x: hill.landing(x)[1] - 0.1, self.x_touchdown,
-                         self.x_touchdown + 200.0)
-        pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
-            t[m], self._out(t[m]), self._ground(hill.landing, p.drag, brake_x), hill.landing,
-            self._sink(t[m]))
+        if m.any():
+            pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
+                t[m], self._out(t[m]), self._ground(hill.landing, p.drag, self._brake_x),
+                hill.landing, self._sink(t[m]))
         return pos, vel, acc
 
     def _angles(self, t):
@@ -219,6 +221,13 @@ class SkiJump:
         return Motion(t, *to_world, (body * mount).as_quat(), mount.inv().apply(omega_body))
 
     def specific_force(self, motion):
-        """Specific force (n, 3) in sensor axes, m/s^2."""
+        """Specific force (n, 3) in sensor axes, m/s^2, on the turning Earth."""
         g = np.array([gravity_world(p, self.gravity) for p in motion.position_world])
-        return Rotation.from_quat(motion.quat_world_imu).inv().apply(motion.acc_world - g)
+        spin = earth_rate_world(self.hill.origin.latitude_deg)
+        force = motion.acc_world - g + 2.0 * np.cross(spin, motion.vel_world)
+        return Rotation.from_quat(motion.quat_world_imu).inv().apply(force)
+
+    def rate(self, motion):
+        """What an ideal gyroscope reads (n, 3), rad/s: the Earth's rotation included."""
+        spin = earth_rate_world(self.hill.origin.latitude_deg)
+        return motion.omega_imu + Rotation.from_quat(motion.quat_world_imu).inv().apply(spin)

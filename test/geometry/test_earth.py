@@ -5,7 +5,7 @@ import pytest
 
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.geometry.geodesy import LocalFrame, hill_axes
-from imu_fusion.geometry.gravity import gravity_world, normal_gravity
+from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import (decimal_year, declination,
                                                 magnetic_field_world)
 
@@ -103,3 +103,9 @@ def test_plumb_line_turns_with_the_place():
     assert np.allclose(-g / np.linalg.norm(g), up, atol=0.01 * 5000 / 6.37e6)
     higher = gravity_world(np.array([0.0, 0.0, 100.0]), 9.8)
     assert abs((higher[2] + 9.8) / 100.0 - 3.08e-6) < 2e-8  # free-air gradient
+
+
+def test_earth_turns_east():
+    # One turn per sidereal day of 86164.1 s; at the equator the axis points north.
+    assert np.allclose(earth_rate_world(0.0) * 86164.1, [0, 2 * np.pi, 0], atol=1e-4)
+    assert earth_rate_world(-90.0)[2] < 0

@@ -8,7 +8,7 @@ from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import ORIENTATION_DTYPE
 from imu_fusion.messages import convert
 from imu_fusion.messages.bag import TYPES
-from imu_fusion.messages.layouts import FIX, IMU, TWIST
+from imu_fusion.messages.layouts import FIX, IMU, POSE, TWIST
 
 STAMP = 1_700_000_123_456_789_012
 
@@ -36,7 +36,7 @@ def test_raw_imu_says_that_orientation_is_absent():
     assert message.orientation_covariance[0] == -1.0
     assert message.linear_acceleration_covariance[0] == -1.0
     assert message.angular_velocity_covariance[0] == 0.0
-    log = convert.imu_log([cdr])
+    log = convert.SAMPLE_TYPES[IMU.msgtype].read([cdr])
     assert np.isnan(log.acc).all() and list(log.gyr[0]) == [1, 2, 3]
     with pytest.raises(TopicError, match="raw data"):
         convert.attitude_log([cdr])
@@ -48,7 +48,7 @@ def test_fix_round_trip_with_and_without_covariance():
                 convert.fix_message(STAMP + 1, "gnss", -33.0, -70.0, 500.0, None, status=-1)]
     assert TYPES.deserialize_cdr(messages[0], FIX.msgtype).position_covariance_type == 3
     assert TYPES.deserialize_cdr(messages[1], FIX.msgtype).position_covariance_type == 0
-    log = convert.fix_log(messages)
+    log = convert.SAMPLE_TYPES[FIX.msgtype].read(messages)
     assert list(log.latitude_deg) == [47.4, -33.0] and list(log.longitude_deg) == [10.3, -70.0]
     assert list(log.height) == [900.0, 500.0] and list(log.status) == [2, -1]
     assert np.array_equal(log.cov_enu[0], cov) and not log.cov_enu[1].any()
@@ -57,7 +57,7 @@ def test_fix_round_trip_with_and_without_covariance():
 def test_velocity_round_trip():
     cov = np.arange(9.0).reshape(3, 3)
     cdr = convert.velocity_message(STAMP, "world", [1, 2, 3], cov)
-    log = convert.velocity_log([cdr])
+    log = convert.SAMPLE_TYPES[TWIST.msgtype].read([cdr])
     assert list(log.vel_world[0]) == [1, 2, 3] and np.array_equal(log.cov_world[0], cov)
     message = TYPES.deserialize_cdr(cdr, TWIST.msgtype)
     assert message.twist.covariance[21] == -1.0  # no angular velocity in it
@@ -65,7 +65,7 @@ def test_velocity_round_trip():
 
 def test_pose_round_trip():
     quat = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_quat()
-    log = convert.pose_log([convert.pose_message(STAMP, "world", quat, (4, 5, 6))])
+    log = convert.SAMPLE_TYPES[POSE.msgtype].read([convert.pose_message(STAMP, "world", quat, (4, 5, 6))])
     assert np.array_equal(log.quat_world_imu[0], quat) and list(log.position_world[0]) == [4, 5, 6]
 
 

@@ -54,11 +54,11 @@ class Graph:
                                  if hasattr(n, "work") and not n.finished)])
             self.executor.spin_once(timeout_sec=pause)
 
-    def call(self, node, service_type, name):
+    def call(self, node, service_type, name, timeout=30.0):
         client = node.create_client(service_type, name)
         self.until(client.service_is_ready)
         future = client.call_async(service_type.Request())
-        self.until(future.done)
+        self.until(future.done, timeout)
         node.destroy_client(client)
         return future.result()
 

@@ -1,9 +1,12 @@
 """The protocol of nodes/flow.py between nodes of this process."""
 
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64
 
-from imu_fusion.nodes import flow
-from imu_fusion.nodes.flow import END, NEXT, WINDOW, FlowSink, FlowSource, Relay
+from imu_fusion.nodes.flow import sink as flow_sink
+from imu_fusion.nodes.flow import source as flow_source
+from imu_fusion.nodes.flow import END, NEXT, WINDOW, FlowSink, FlowSource, Relay, sensor_qos
 
 
 class Sender:
@@ -30,18 +33,18 @@ class Sender:
 
 
 class Receiver:
-    def __init__(self, graph, name="receiver", topic="/numbers", **options):
+    def __init__(self, graph, name="receiver", topic="/numbers", qos=None, **options):
         self.values, self.ended, self.begun = [], [], 0
         self.node = graph.node(name)
         self.sink = FlowSink(self.node, on_begin=self._begin,
                              on_end=lambda session: self.ended.append(session.event), **options)
-        self.inbox = self.sink.subscribe(Int64, topic, self._store)
+        self.inbox = self.sink.subscribe(Int64, topic, self._store, qos)
 
     def _begin(self, session):
         self.begun += 1
 
     def _store(self, cdr, info):
-        self.values.append(int.from_bytes(cdr[4:12], "little"))
+        self.values.append(int.from_bytes(cdr[4:12], "little", signed=True))
 
 
 class Doubler:
@@ -216,7 +219,7 @@ def test_without_a_session_messages_flow_unacknowledged(graph):
 
 def test_loss_is_counted_and_the_session_still_ends(graph, monkeypatch):
     """A lossy link: the receiver is handed every third message only, and not the last two."""
-    monkeypatch.setattr(flow, "PATIENCE", 0.5)
+    monkeypatch.setattr(flow_sink, "PATIENCE", 0.5)
     receiver = Receiver(graph)
     sender = Sender(graph, wait_for=["receiver"])
     numbers = []
@@ -238,3 +241,89 @@ def test_sink_that_takes_nothing_answers_and_is_not_waited_for_at_the_end(graph)
     sender.session(10)
     graph.until(lambda: receiver.ended and sender.source.session is None)
     assert sender.source.report() == {"/numbers": (10, {"/receiver": 0})}
+
+
+def test_remapped_names_are_those_of_the_graph(graph):
+    """Both ends speak of resolved names: a remapped sink is known to take the topic."""
+    node = graph.add(rclpy.create_node("remapped", cli_args=[
+        "--ros-args", "-r", "/private:=/numbers", "-r", "__ns:=/deep"]))
+    got = []
+    sink = FlowSink(node)
+    inbox = sink.subscribe(Int64, "/private", lambda cdr, info: got.append(cdr))
+    sender = Sender(graph, wait_for=["/deep/remapped"])
+    sender.session(10)
+    graph.until(lambda: sender.source.session is None)
+    assert inbox.topic == "/numbers" and len(got) == 10
+    assert sender.source.report() == {"/numbers": (10, {"/deep/remapped": 0})}
+
+
+def test_node_between_waits_for_sinks_that_only_its_source_has_discovered(graph):
+    """Discovery between each two nodes takes its own time. Here the doubler cannot see the
+    receiver, and the receiver does not hear of the doubler's session, until told."""
+    receiver, doubler = Receiver(graph, topic="/doubled"), Doubler(graph)
+    doubler.node.get_publishers_info_by_topic = lambda topic: []
+    late = []
+    hear = receiver.sink._on_status
+
+    def deaf(message):
+        (late.append if message.name == "/doubler" else hear)(message)
+
+    receiver.sink._on_status = deaf
+    replaced = [s for s in receiver.node.subscriptions if s.topic_name == flow_sink.STATUS_TOPIC]
+    replaced[0].callback = deaf
+    sender = Sender(graph, wait_for=["doubler", "receiver"])
+    sender.session(100)
+    graph.until(lambda: late and "/receiver" in doubler.relay.source.waiting_for())
+    graph.until(lambda: "/doubler" in sender.source.waiting_for())
+    assert sender.out.sent == 0
+    replaced[0].callback = hear
+    hear(late[-1])
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == [i for i in range(100) for _ in range(2)] + [999_999]
+    assert receiver.inbox.missed == 0
+
+
+def test_sink_known_by_hearsay_only_is_given_up_after_a_while(graph, monkeypatch):
+    """A killed node stays in the graph of some for up to 20 s."""
+    monkeypatch.setattr(flow_source, "HEARSAY", 0.3)
+    receiver, doubler = Receiver(graph, topic="/doubled"), Doubler(graph)
+    sender = Sender(graph, wait_for=["doubler", "receiver"])
+    announce = sender.source._announce
+
+    def with_a_ghost():
+        sender.source._consumers["/ghost"] = sender.source._consumers["/doubler"]
+        announce()
+        del sender.source._consumers["/ghost"]
+
+    sender.source._announce = with_a_ghost
+    sender.session(100)
+    graph.until(lambda: "/ghost" in doubler.relay.source.waiting_for())
+    graph.until(lambda: receiver.ended)
+    assert len(receiver.values) == 201
+
+
+def test_best_effort_sink_listens_reliably_during_a_session_and_only_then(graph):
+    """A driver that offers best effort is heard before and after; a replay loses nothing."""
+    receiver = Receiver(graph, qos=sensor_qos())
+    driver = graph.node("driver").create_publisher(
+        Int64, "/numbers", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Int64(data=-1))
+    graph.until(lambda: receiver.values == [-1])
+    sender = Sender(graph, wait_for=["receiver"])
+    sender.session(20_000)
+    graph.until(lambda: receiver.ended and sender.source.session is None)
+    assert receiver.values == [-1, *range(20_000)]
+    assert receiver.inbox.lost == receiver.inbox.missed == 0
+    graph.until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Int64(data=-2))
+    graph.until(lambda: receiver.values[-1] == -2)
+
+
+def test_best_effort_sink_hears_a_loop_without_gaps(graph):
+    receiver = Receiver(graph, qos=sensor_qos())
+    sender = Sender(graph, wait_for=["receiver"])
+    for event in (NEXT, NEXT, END):
+        sender.session(300, event=event)
+        graph.until(lambda: sender.source.session is None)
+    assert receiver.values == 3 * list(range(300)) and receiver.ended == [NEXT, NEXT, END]

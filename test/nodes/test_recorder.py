@@ -9,9 +9,10 @@ from std_msgs.msg import Int64, String
 
 from imu_fusion.errors import BagError, ParameterError
 from imu_fusion.messages.bag import open_bag
+from imu_fusion.nodes.flow import FlowSource
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
-from test.nodes.conftest import write_bag
+from test.nodes.conftest import START, STEP, write_bag
 
 
 def contents(path):
@@ -148,3 +149,41 @@ def test_does_not_overwrite_unless_told(graph, bag):
     with pytest.raises(BagError, match="not empty"):
         graph.start(Recorder, out=str(bag))
     graph.start(Recorder, out=str(bag), overwrite=True)
+
+
+def test_sim_time_is_the_log_time(graph, bag, tmp_path):
+    """Every 4th message has a /clock of its own stamp; none is written at time 0."""
+    recorder = graph.start(Recorder, out=str(tmp_path / "out"), topics=["/imu/data_raw"],
+                           use_sim_time=True)
+    replayer = graph.start(Replayer, bag=str(bag), rate=1.0, duration=0.5, clock=25.0,
+                           wait_for_subscribers=0, wait_for_nodes=["recorder"])
+    graph.until(lambda: recorder.finished and replayer.finished)
+    graph.close(recorder)
+    with open_bag(tmp_path / "out") as reader:
+        times = [m[2] for m in reader.messages()]
+    assert len(times) == 50
+    # at the recorded pace a clock of 25 Hz is at most a period behind, or a little ahead
+    assert all(START <= t < START + 51 * STEP for t in times)
+    assert all((t - START) % (4 * STEP) == 0 for t in times)
+    assert len(set(times)) > 5
+
+
+def test_sim_time_without_a_clock_still_finds_topics(graph, tmp_path):
+    recorder = graph.start(Recorder, out=str(tmp_path / "out"), use_sim_time=True)
+    publisher = graph.node("talker").create_publisher(Int64, "/x", 10)
+    graph.until(lambda: publisher.get_subscription_count() == 1)
+    assert not recorder.finished
+
+
+def test_ends_when_an_unrelated_session_ends_last(graph, tmp_path):
+    """The session of /b, of which nothing is recorded, ends after the one that counts."""
+    recorder = graph.start(Recorder, out=str(tmp_path / "out"), topics=["/a"])
+    first, second = (FlowSource(graph.node(name), wait_for=["recorder"]) for name in "ab")
+    out = first.publisher(Int64, "/a")
+    second.publisher(Int64, "/b")
+    first.begin()
+    second.begin()
+    graph.until(lambda: first.ready() and second.ready())
+    out.publish(Int64(data=1))
+    first.end()
+    graph.until(lambda: recorder.finished)

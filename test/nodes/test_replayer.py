@@ -128,7 +128,7 @@ def test_foreign_subscribers_are_served_at_the_pace_given_for_them(graph, bag):
     """They cannot acknowledge. 1 s of data at 5 times the pace lasts 0.2 s, not nothing."""
     got = []
     graph.node("stranger").create_subscription(
-        Imu, IMU, lambda m: got.append(m.linear_acceleration.x), 200)  # room for all: no flow control
+        Imu, IMU, lambda m: got.append(m.linear_acceleration.x), 200)  # room: no flow control
     sink = collector(graph)
     times = []
     sink.sink.inboxes[IMU].callback = lambda cdr, info: times.append(info["source_timestamp"])

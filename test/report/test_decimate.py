@@ -9,7 +9,7 @@ from imu_fusion.report.decimate import decimate, envelope
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(1, 5000), st.integers(0, 2 ** 31), st.integers(4, 300))
+@given(st.integers(1, 5000), st.integers(0, 2 ** 31), st.integers(6, 300))
 def test_every_spike_survives_and_the_length_is_bounded(n, seed, points):
     rng = np.random.default_rng(seed)
     time, values = np.arange(n) * 0.01, rng.normal(size=n)
@@ -21,15 +21,15 @@ def test_every_spike_survives_and_the_length_is_bounded(n, seed, points):
     np.testing.assert_array_equal(values[np.searchsorted(time, short_time)], short)
 
 
-def test_a_stretch_without_values_stays_a_break_and_single_holes_vanish():
+def test_holes_break_the_line_and_nothing_else_does():
     values = np.ones(10000)
     values[4000:6000] = np.nan
     values[100] = np.nan
-    time, short = decimate(np.arange(10000), values, 200)
-    absent = np.isnan(short)
-    assert absent.any() and np.all((time[absent] >= 4000) & (time[absent] < 6000))
-    assert not np.isnan(decimate(np.arange(10), np.ones(10), 200)[1]).any()
-    assert np.isnan(decimate(np.arange(1000), np.full(1000, np.nan), 100)[1]).all()
+    time, short = decimate(np.arange(10000), values, 300)
+    assert len(short) <= 300
+    np.testing.assert_array_equal(time[np.isnan(short)], [100, 4000])
+    assert not np.isnan(decimate(np.arange(10000), np.ones(10000), 300)[1]).any()
+    assert len(decimate(np.arange(1000), np.full(1000, np.nan), 100)[1]) == 0
 
 
 def test_a_band_is_never_drawn_narrower_than_it_is():

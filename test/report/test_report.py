@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,14 +11,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.errors import ImuFusionError, TopicError
 from imu_fusion.messages.bag import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message, pose_message
-from imu_fusion.report.figures import Line, Panel, break_wraps, intervals, time_figure
+from imu_fusion.report.figures import Band, Line, Panel, break_wraps, intervals, time_figure
+from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import (
     Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
 from imu_fusion.report.orientation import euler_zyx
 from imu_fusion.report.recording import write_orientation_report
+from imu_fusion.samples import FixLog, VelocityLog
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 START = 1_700_000_000_000_000_000
@@ -109,14 +113,14 @@ def test_a_report_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_the_report_of_a_real_recording_is_complete_and_bounded(tmp_path):
-    """Without estimates it is about the recording; the flight's autopilot is named as what it is."""
+    """Without estimates it is about the recording."""
     out = tmp_path / "report.html"
     write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
     page = Page(out.read_text())
     assert "holds no estimates" in page.text and "/onboard_ekf/pose" in page.text
     assert "13656" in page.text and "136.55" in page.text and "214 gaps" in page.text
     headings = re.findall(r"<h2>(.*?)</h2>", out.read_text())
-    assert headings == ["Summary", "The recording", "Angular rates and specific force"]
+    assert headings == ["Summary", "The recording", "Angular rates and specific force", "GNSS"]
     assert out.stat().st_size < 8e6
 
 
@@ -125,8 +129,8 @@ def test_hours_of_data_give_a_page_of_bounded_size():
     time = np.arange(n) * 0.0035
     lines = tuple(Line(f"s{i}", time, np.sin(time * (i + 1)), "#000000") for i in range(3))
     text = Figure(time_figure([Panel("y", lines)] * 3)).render()
-    # 9 lines x 3000 points x 2 x float32 in base64 are 290 kB; plotly's escaping can double it.
-    assert len(text) < 600_000
+    # 9 lines x 3000 points x 2 x float32 in base64 are 288 kB.
+    assert len(text) < 300_000
 
 
 def test_time_axes_are_one_and_all_panels_are_labelled():
@@ -138,6 +142,20 @@ def test_time_axes_are_one_and_all_panels_are_labelled():
     assert "time" in figure.layout.xaxis2.title.text
     # One legend entry per name, however many panels it is in.
     assert [t.name for t in figure.data if t.showlegend is not False] == ["a", "on"]
+
+
+def test_a_band_breaks_where_it_wraps_or_is_not_determined():
+    time = np.arange(8.0)
+    angle = np.array([170, 175, 179, -178, -174, -170, -166, -162.0])
+    sd = np.array([1, 1, 1, 1, 1, 300, 1, 1.0])
+    figure = time_figure([Panel("yaw", (
+        Band("b", time, angle - sd, angle + sd, widest=180.0),))])
+    y = np.asarray(figure.data[0].y)
+    # Two outlines, of 3 and 4 samples: before the wrap, and after it without the wide one.
+    assert np.isnan(y).sum() == 2
+    assert np.nanmax(np.abs(y)) == 180
+    outlines = np.split(y, np.flatnonzero(np.isnan(y)) + 1)
+    assert all(len(np.unique(np.sign(o[np.isfinite(o)]))) == 1 for o in outlines if len(o) > 1)
 
 
 def test_euler_angles_and_their_standard_deviations():
@@ -166,3 +184,70 @@ def test_stretches_and_wraps():
     assert intervals(np.arange(2.0), np.zeros(2, bool)) == []
     np.testing.assert_array_equal(np.isnan(break_wraps([170, 179, -179, -170])),
                                   [False, False, True, False])
+
+
+def test_damaged_samples_are_left_out_and_told(tmp_path):
+    """Zero quaternions, NaN, repeated and backward stamps do not stop a report."""
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(300):
+            stamp = START + (i if i != 50 else 49) * 10_000_000
+            quat = [0, 0, 0, 0] if i == 10 else [0, 0, 0, 1]
+            acc = [np.nan if i == 20 else 0.0, 0.0, 9.81] + rng.normal(0, 0.05, 3)
+            writer.write("/imu/data_raw", "sensor_msgs/msg/Imu",
+                         imu_message(stamp, "i", [0, 0, 0], acc), START + i * 10_000_000)
+            writer.write("/imu/data", "sensor_msgs/msg/Imu",
+                         imu_message(stamp, "i", [0, 0, 0], acc, quat, np.eye(3) * 1e-4),
+                         START + i * 10_000_000)
+            writer.write("/reference/pose", "geometry_msgs/msg/PoseStamped",
+                         pose_message(stamp, "world", quat), START + i * 10_000_000)
+    out = tmp_path / "report.html"
+    write_orientation_report(tmp_path / "bag", tmp_path / "bag", out)
+    text = Page(out.read_text()).text
+    assert "reference/pose: 1 orientations are zero" in text
+    assert "1 samples left out: repeated stamp" in text
+    assert "not finite" in text
+
+
+def test_a_recording_without_messages_is_told(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/imu/data_raw", "sensor_msgs/msg/Imu")
+    with pytest.raises(TopicError, match="no messages"):
+        write_orientation_report(tmp_path / "bag", tmp_path / "bag", tmp_path / "r.html")
+
+
+def test_gnss_track_has_the_true_extent():
+    """0.001 deg of latitude are 111.19 m on a meridian near 47 deg (WGS84: 111.18 m)."""
+    n = 11
+    fix = FixLog(np.arange(n) * 10 ** 9, 47 + np.linspace(0, 1e-3, n), np.full(n, 8.0),
+                 np.linspace(400, 410, n), np.tile(np.eye(3) * 4.0, (n, 1, 1)),
+                 np.r_[np.zeros(n - 1), -1])
+    velocity = VelocityLog(fix.stamp, np.tile([3.0, 4.0, 1.0], (n, 1)), np.zeros((n, 3, 3)))
+    section = gnss_section(fix, velocity, 0)
+    cells = {row[0]: row[1] for row in section.blocks[0].rows}
+    # The last one has no fix: nine tenths of the way.
+    assert float(cells["extent north"]) == pytest.approx(0.9 * 111.18, abs=0.1)
+    assert float(cells["extent east"]) == 0.0
+    assert float(cells["greatest horizontal speed"]) == 5.0
+    assert "2.000 / 2.000 / 2.000" in cells["median stated σ east, north, up"]
+    assert "No message" in gnss_section(fix[-1:], None, 0).blocks[0].text
+
+
+@pytest.mark.slow
+def test_a_real_browser_draws_every_figure_offline(tmp_path):
+    browser = next((p for p in map(shutil.which, ("chromium", "chromium-browser")) if p), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    out = tmp_path / "report.html"
+    write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    drawn = subprocess.run(
+        [browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+         "--disable-background-networking", "--disable-component-update", "--disable-sync",
+         "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'user'}",
+         "--virtual-time-budget=20000", "--dump-dom", out.as_uri()],
+        check=True, capture_output=True, text=True, timeout=120).stdout
+    figures = len(Page(out.read_text()).figures)
+    assert figures == 4
+    # plotly marks every element that it has drawn into, and puts one layer of axes there.
+    assert len(re.findall(r'<div class="plot[^>]*js-plotly-plot', drawn)) == figures
+    assert drawn.count('class="cartesianlayer"') == figures

@@ -118,6 +118,18 @@ def test_gyroscope_in_degrees_and_reversed_is_seen_by_the_field():
     assert finding.kind == "axes"
 
 
+def test_axes_are_judged_in_spite_of_a_noisy_magnetometer_and_not_at_rest():
+    # 1 uT of noise: more than the field turns by from sample to sample.
+    imu, mag = recording(mag_noise=1e-6)
+    assert checks.check_axes(imu, mag, "m") == []
+    degrees = ImuLog(imu.stamp, np.degrees(imu.gyr), imu.acc)
+    assert kinds(checks.check_axes(degrees, mag, "m")) == ["unit"]
+    assert checks.check_axes(degrees[:90], mag[:90], "m") == []  # at rest: nothing to tell by
+    # An empty, a short and a stuck log have no axes to judge.
+    for bad in (mag[:0], mag[:2], MagLog(np.zeros(50, np.int64), mag.mag[:50])):
+        assert checks.check_axes(imu, bad, "m") == []
+
+
 def test_clipped_peaks_are_saturation_and_round_peaks_are_not():
     imu, _ = recording(gyr_noise=1e-3)
     clipped = np.clip(imu.gyr, -1.5, 1.5)

@@ -92,18 +92,19 @@ class Measurements:
     whiten: np.ndarray
     loss: np.ndarray
 
-    def attach(self, imu_stamp, time_offset):
+    def attach(self, imu_stamp, fix_late, velocity_late):
         """Bind each reading to the sample before it.
 
         Args:
             imu_stamp: (N,) ns.
-            time_offset: s by which GNSS stamps are late.
+            fix_late, velocity_late: s by which the stamps of fixes and velocities are late.
 
         Returns:
             order (m,) of the readings used, start (N + 1,), tau (m,) s after the sample.
         """
-        late = np.int64(round(time_offset * 1e9))
-        stamp = self.stamp - np.where(self.kind == MAG, 0, late)
+        late = np.zeros(3, np.int64)
+        late[FIX], late[VELOCITY] = round(fix_late * 1e9), round(velocity_late * 1e9)
+        stamp = self.stamp - late[self.kind]
         inside = (stamp >= imu_stamp[0]) & (stamp <= imu_stamp[-1])
         order = np.flatnonzero(inside)
         order = order[np.lexsort((self.kind[order], stamp[order]))]
@@ -168,14 +169,14 @@ def evaluate_constraints(constraints, position_world, stamp, events, margin):
         position_world: (N, 3) m, in the frame of the surface.
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
-        margin: s around the events without constraint.
+        margin: s around the events in which heights are free.
 
     Returns:
         start (N + 1,), residual (r,), gradient (r, 3), sigma (r,), height (r,).
     """
     pieces = []
-    late = np.int64(round(margin * 1e9))
     for constraint in constraints:
+        late = np.int64(round(margin * 1e9)) if constraint.height else np.int64(0)
         active = np.ones(len(stamp), bool)
         if constraint.phase == "in_run":
             active = stamp <= events.takeoff - late

@@ -27,6 +27,7 @@ class Problem:
     params: object
     measurements: object
     gravity: float
+    earth_rate: np.ndarray
     field_world: np.ndarray
     constraints: tuple
     layout: np.ndarray
@@ -44,17 +45,19 @@ class Problem:
             if self.layout[block] >= 0:
                 columns += range(self.layout[block], self.layout[block] + width)
         self.motion = (self.imu.steps, self.imu.means, self.imu.noise, self.gravity,
-                       self.decay_rate, self.walk, self.layout, np.array(columns),
+                       self.earth_rate, self.decay_rate, self.walk, self.layout, np.array(columns),
                        self.field_world, np.array(self.params.gnss_lever_arm))
         self.size = n
-        self.attach(0.0)
+        self.attach()
         no_rows = np.zeros(len(self.imu.log) + 1, np.int64)
         self.rows = (no_rows, np.empty(0), np.empty((0, 3)), np.empty(0), np.empty(0, bool))
 
-    def attach(self, time_offset):
-        """Bind the measurements to samples, for a delay of the GNSS stamps."""
+    def attach(self):
+        """Bind the measurements to samples, for the delays of their stamps found so far."""
         m = self.measurements
-        self.order, start, tau = m.attach(self.imu.log.stamp, time_offset)
+        common, extra = (0.0 if i < 0 or self.x is None else float(self.x[0, i + 1])
+                         for i in self.layout[[model.TIME_OFFSET, model.VELOCITY_OFFSET]])
+        self.order, start, tau = m.attach(self.imu.log.stamp, common, common + extra)
         self.attached = (start, m.kind[self.order], tau, m.value[self.order],
                          m.whiten[self.order], m.loss[self.order])
         self.innovation = np.zeros((len(self.order), 3))
@@ -132,16 +135,20 @@ def solve(problem, events, refine):
     params = problem.params
     margin = params.event_margin
     problem.follow()
-    offset_index = problem.layout[model.TIME_OFFSET]
+    moving = (problem.layout[[model.TIME_OFFSET, model.VELOCITY_OFFSET]] >= 0).any()
     refined, converged, steps = events is None, False, 0
     while steps < params.max_iterations:
         largest, _, _ = problem.step(events, margin)
         steps += 1
-        if offset_index >= 0:
-            problem.attach(problem.x[0, offset_index + 1])
-        if not np.isfinite(problem.cost[-1]):
+        if not np.isfinite(problem.cost[-1] + largest.sum()):
             break
-        if largest.max() > params.tolerance:
+        if moving:
+            problem.attach()
+        # Where readings change their sample as a delay is found, the step may end in a tiny
+        # cycle that no cost tells apart.
+        still = len(problem.cost) > 1 and (
+            abs(problem.cost[-1] - problem.cost[-2]) <= params.cost_tolerance)
+        if largest.max() > params.tolerance and not still:
             continue
         if refined:
             converged = True

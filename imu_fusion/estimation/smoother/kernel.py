@@ -16,13 +16,13 @@ import math
 import numpy as np
 from numba import njit
 
-from imu_fusion.estimation.smoother.model import (ATT, BODY_HEIGHT, FIX, LEVER_ARM, POS, VEL,
-                                                  VELOCITY, interval, predict_fix, predict_mag,
-                                                  predict_velocity)
+from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE, FIX,
+                                                  LEVER_ARM, POS, VEL, VELOCITY, interval,
+                                                  predict_fix, predict_mag, predict_velocity)
 from imu_fusion.geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 
-#: Longest list of non-zero entries of a measurement row.
-MAX_ENTRIES = 24
+#: Longest list of non-zero entries of a row: all states, should one not be finite.
+MAX_ENTRIES = CORE + sum(width for _, width in BLOCKS)
 
 #: Samples kept at once by the backward pass.
 SEGMENT = 128
@@ -124,7 +124,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             instead of being kept (linear pass about x).
         x: nominal states (N, n + 1).
         motion: steps dt (N - 1,) s; means of gyr and acc (N - 1, 6); their noise variance
-            densities (N - 1, 6); gravity; decay rates (n,) and walk variance densities (n,) of
+            densities (N - 1, 6); gravity; Earth rate (3,); decay rates (n,) and walk variance densities (n,) of
             the slow states; layout; columns of the transition matrix in use; magnetic field
             (3,); lever arm (3,).
         measured: sorted by sample: start (N + 1,), kind, tau, value (M, 3), whitening matrix
@@ -137,7 +137,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
     Returns:
         Sum of the losses of all rows at the nominal trajectory.
     """
-    stamps, inputs, noise, gravity, rates, walks, layout, columns, field, lever_arm = motion
+    stamps, inputs, noise, gravity, spin, rates, walks, layout, columns, field, lever_arm = motion
     m_start, m_kind, m_tau, m_value, m_whiten, m_loss = measured
     c_start, c_residual, c_gradient, c_sigma, c_height = rows
     (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
@@ -159,7 +159,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             dt = stamps[k]
             for i in range(9, n):
                 decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
-            rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, decay,
+            rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, spin, decay,
                                         layout, f_vel, f_att, x_next, rate, force)
         if layout[LEVER_ARM] >= 0:
             for i in range(3):
@@ -240,7 +240,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             boxplus(x[k], delta)
             delta[:] = 0.0
             if has_interval:
-                rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity,
+                rotation, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, spin,
                                             decay, layout, f_vel, f_att, x_next, rate, force)
         if store:
             r_start[k - first + 1] = n_rows
@@ -336,7 +336,7 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
     Returns:
         Sum of the squared normalised process noise.
     """
-    stamps, inputs, noise, gravity, rates, walks, layout, columns, _, _ = motion
+    stamps, inputs, noise, gravity, spin, rates, walks, layout, columns, _, _ = motion
     (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
     n = len(adjoint)
     f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
@@ -351,7 +351,7 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
             dt = stamps[k]
             for i in range(9, n):
                 decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
-            _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, decay,
+            _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, spin, decay,
                                  layout, f_vel, f_att, x_next, rate, force)
             _interval_noise(noise[k, 3:6], middle, dt, spread)
             for i in range(3):

@@ -20,10 +20,10 @@ POS, VEL, ATT, GYR_BIAS, ACC_BIAS, CORE = 0, 3, 6, 9, 12, 15
 
 #: Optional blocks of the error state, in their order, with their sizes.
 BLOCKS = (("mag_bias", 3), ("mag_scale", 3), ("gnss_position_error", 3),
-          ("gnss_time_offset", 1), ("acc_matrix", 9), ("gyr_scale", 3),
-          ("gnss_lever_arm", 3), ("body_height", 1))
-(MAG_BIAS, MAG_SCALE, GNSS_ERROR, TIME_OFFSET, ACC_MATRIX, GYR_SCALE, LEVER_ARM,
- BODY_HEIGHT) = range(8)
+          ("gnss_time_offset", 1), ("velocity_time_offset", 1), ("acc_matrix", 9),
+          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1))
+(MAG_BIAS, MAG_SCALE, GNSS_ERROR, TIME_OFFSET, VELOCITY_OFFSET, ACC_MATRIX, GYR_SCALE,
+ LEVER_ARM, BODY_HEIGHT) = range(9)
 
 FIX, VELOCITY, MAG = 0, 1, 2
 
@@ -58,20 +58,25 @@ def _product(a, b):
 
 
 @njit(cache=True)
-def interval(x, gyr, acc, dt, gravity, decay, layout, f_vel, f_att, x_next, rate, force_world):
+def interval(x, gyr, acc, dt, gravity, spin, decay, layout, f_vel, f_att, x_next, rate,
+             force_world):
     """Carry the state x over one interval; derivatives of velocity and attitude.
+
+    The rotation of the Earth enters as a known rate and the Coriolis acceleration; their
+    own derivatives (1e-4 per second) are left out of the transition.
 
     Args:
         x: state (n + 1,).
         gyr, acc: means over the interval (3,).
         dt: s.
         gravity: m/s^2 at the origin.
+        spin: (3,) Earth rate in the world, rad/s.
         decay: (n,) factors of the slow states over the interval.
         layout: first index of the optional blocks.
         f_vel, f_att: (3, n), rows of the transition matrix; f_vel without the identity of the
             velocity itself. Entries that no block uses stay zero.
         x_next: (n + 1,) result.
-        rate: (3,) corrected rate, result.
+        rate: (3,) corrected rate against the world, result.
         force_world: (3,) acceleration, result.
 
     Returns:
@@ -88,14 +93,19 @@ def interval(x, gyr, acc, dt, gravity, decay, layout, f_vel, f_att, x_next, rate
         for i in range(3):
             for j in range(3):
                 force[i] += x[layout[ACC_MATRIX] + 1 + 3 * i + j] * acc[j]
+    start = quat_to_matrix(x[6:10])
+    for i in range(3):
+        for j in range(3):
+            rate[i] -= start[j, i] * spin[j]
     turn = rate * dt
     half = quat_exp(0.5 * turn)
     middle_quat = quat_multiply(x[6:10], half)
-    start = quat_to_matrix(x[6:10])
     half_turn = quat_to_matrix(half)
     middle = _product(start, half_turn)
     g = gravity_world(x[0:3], gravity)
     for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        g[i] -= 2.0 * (spin[a] * x[3 + b] - spin[b] * x[3 + a])
         force_world[i] = (middle[i, 0] * force[0] + middle[i, 1] * force[1]
                           + middle[i, 2] * force[2] + g[i])
         x_next[i] = x[i] + dt * (x[3 + i] + 0.5 * dt * force_world[i])
@@ -178,9 +188,10 @@ def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, lever, layo
         h[i, VEL + i] = 1.0
         for j in range(3):
             h[i, ATT + j] += tau / dt * f_vel[i, ATT + j]
-    if layout[TIME_OFFSET] >= 0:
-        for i in range(3):
-            h[i, layout[TIME_OFFSET]] = -force_world[i]
+    for block in (TIME_OFFSET, VELOCITY_OFFSET):
+        if layout[block] >= 0:
+            for i in range(3):
+                h[i, layout[block]] = -force_world[i]
     if layout[LEVER_ARM] >= 0:
         _cross_matrix(rotation, rate, 1.0, h, 0, layout[LEVER_ARM])
     return predicted

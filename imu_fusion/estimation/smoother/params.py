@@ -33,9 +33,9 @@ class SmootherParams(Parameters):
                              low=0.0)
     max_gap: float = param(0.1, doc="Longest step between Imu samples that counts as sampled; "
                            "longer ones are bridged with unknown motion", unit="s", low=1e-3)
-    unknown_gyr_density: float = param(1.0, doc="Noise of the rate where it was clipped or not "
+    unknown_gyr_density: float = param(0.1, doc="Noise of the rate where it was clipped or not "
                                        "recorded", unit="rad/s/sqrt(Hz)", low=1e-3)
-    unknown_acc_density: float = param(5.0, doc="Noise of the force where it was clipped or not "
+    unknown_acc_density: float = param(2.0, doc="Noise of the force where it was clipped or not "
                                        "recorded", unit="m/s^2/sqrt(Hz)", low=1e-3)
 
     fix_sd: tuple[float, ...] = param((3.0, 3.0, 5.0), doc="Position noise east, north, up, "
@@ -52,6 +52,9 @@ class SmootherParams(Parameters):
     gnss_position_error_tau: float = param(30.0, doc="Its correlation time", unit="s", low=0.1)
     gnss_time_offset_sd: float = param(0.0, doc="Delay of the GNSS stamps as a state", unit="s",
                                        low=0.0, high=2.0)
+    velocity_time_offset_sd: float = param(0.0, doc="Further delay of velocities alone as a state; "
+                                           "receivers that difference positions report late",
+                                           unit="s", low=0.0, high=2.0)
     gnss_lever_arm: tuple[float, ...] = param((0.0, 0.0, 0.0), doc="Antenna in the imu frame",
                                               unit="m", length=3)
     gnss_lever_arm_sd: float = param(0.0, doc="Its uncertainty, as states", unit="m", low=0.0)
@@ -80,3 +83,5 @@ class SmootherParams(Parameters):
     max_iterations: int = param(25, doc="Most Gauss-Newton steps", low=1, high=200)
     tolerance: float = param(1e-3, doc="Converged when no position (m), velocity (m/s) and "
                              "attitude (rad) moves by more", low=1e-9)
+    cost_tolerance: float = param(0.05, doc="Converged as well when the cost (half a sum of squared "
+                                  "standard deviations) changes by less", low=0.0)

@@ -11,7 +11,7 @@ from imu_fusion.estimation.smoother import initial, iterated, model
 from imu_fusion.estimation.smoother.inputs import prepare_imu, prepare_measurements
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.geometry.gravity import normal_gravity
+from imu_fusion.geometry.gravity import earth_rate_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
 from imu_fusion.surfaces.hill import Hill
 
@@ -97,14 +97,14 @@ class Smoother:
         hill = surface if isinstance(surface, Hill) and events is not None else None
 
         def refine(problem, events):
-            return refine_jump(hill, _positions(problem), imu, events)
+            return refine_jump(hill, _positions(problem), prepared.log, events)
 
         events, steps, converged, cov, var = iterated.solve(
             problem, events if hill is not None else None, refine)
         if not np.isfinite(problem.x).all():
             raise EstimationError("the smoother diverged: noise far below that of the data, or "
                                   "measurements of another recording")
-        return self._result(problem, frame, imu, hill, events, steps, converged, cov, var)
+        return self._result(problem, frame, hill, events, steps, converged, cov, var)
 
     def _problem(self, prepared, frame, measurements, constraints, fix):
         p = self.params
@@ -113,7 +113,8 @@ class Smoother:
         blocks = {"mag_bias": [p.mag_bias_sd * 1e6] * 3 if has_mag else 0,
                   "mag_scale": [p.mag_scale_sd] * 3 if has_mag else 0,
                   "gnss_position_error": wander if wander.any() else 0,
-                  "gnss_time_offset": [p.gnss_time_offset_sd], "acc_matrix": [p.acc_matrix_sd] * 9,
+                  "gnss_time_offset": [p.gnss_time_offset_sd],
+                  "velocity_time_offset": [p.velocity_time_offset_sd], "acc_matrix": [p.acc_matrix_sd] * 9,
                   "gyr_scale": [p.gyr_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
                   "body_height": [p.body_height_sd]}
         present = {name: sd for name, sd in blocks.items() if np.any(sd)}
@@ -140,7 +141,7 @@ class Smoother:
                                              frame.height, decimal_year(fix.stamp[0]))
         return iterated.Problem(
             imu=prepared, params=p, measurements=measurements, gravity=gravity,
-            field_world=np.array(field) * 1e6, constraints=constraints, layout=layout,
+            earth_rate=earth_rate_world(frame.latitude_deg), field_world=np.array(field) * 1e6, constraints=constraints, layout=layout,
             prior_sd=sd, decay_rate=decay, walk=walk)
 
     def _initialise(self, problem, mag, initial_quat):
@@ -176,7 +177,7 @@ class Smoother:
             candidates = 12 if reading is None else 4
         problem.search_heading(initial.headings(initial_quat, candidates))
 
-    def _result(self, problem, frame, imu, hill, events, steps, converged, cov, var):
+    def _result(self, problem, frame, hill, events, steps, converged, cov, var):
         recorded = problem.imu.recorded
         x, layout, log = problem.x[recorded], problem.layout, problem.imu.log
         cov, sd = cov[recorded], np.sqrt(np.maximum(var[recorded], 0.0))
@@ -209,7 +210,7 @@ class Smoother:
                        for kind, name in _KINDS.items() if np.any(kinds == kind)}
         jump = None
         if hill is not None:
-            jump = jump_result(hill, samples, imu, events)
+            jump = jump_result(hill, samples, log, events)
         return SmootherResult(samples, frame, states, innovations, tuple(problem.cost), steps,
                               converged, events, jump)
 

@@ -1,0 +1,256 @@
+"""The smoother between its topics: a collection of samples in, a trajectory out.
+
+The node collects while a bag plays or a robot runs; batch reads whole logs. Both
+end in :func:`smooth`, and so in the same messages.
+"""
+
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError, MessageError, SampleError
+from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.messages.bag import TYPES
+from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message, imu_message
+from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
+from imu_fusion.parameters import Parameters, param
+from imu_fusion.samples import checks
+from imu_fusion.samples.guard import Guard, Verdict
+from imu_fusion.surface_file import load_surface
+
+IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
+FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
+INPUTS = {topic: SAMPLE_TYPES[layout.msgtype] for topic, layout in (
+    (IMU_TOPIC, IMU), (MAG_TOPIC, MAG), (FIX_TOPIC, FIX), (VELOCITY_TOPIC, TWIST))}
+REQUIRED = (IMU_TOPIC, FIX_TOPIC)
+
+ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
+SMOOTHED_FIX_TOPIC, PATH_TOPIC = "smoother/fix", "smoother/path"
+PATH_TYPE = "nav_msgs/msg/Path"
+OUTPUTS = {ODOMETRY_TOPIC: ODOMETRY.msgtype, SMOOTHED_IMU_TOPIC: IMU.msgtype,
+           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE}
+
+
+@dataclass(frozen=True)
+class SmoothingParams(SmootherParams):
+    """The smoother's parameters and what surrounds it."""
+
+    surface: str = param("", path=True, doc="Surface that the body moves on: a name in "
+                         "config/surfaces or the path of a YAML file; empty: none.")
+    path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
+                             doc="Rate of the poses of smoother/path.")
+
+
+@dataclass(frozen=True)
+class SmootherNodeParams(Parameters):
+    """What concerns the node, not the trajectory."""
+
+    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
+                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
+                         "for repeats of what was lost (replay).")
+    memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
+                                doc="Collected samples may take this much; then no more are "
+                                    "taken, and smoothing is refused until smoother/clear.")
+
+
+class Collection:
+    """Samples of the smoother's topics, as they come; guarded, in compact arrays.
+
+    One Imu sample takes 56 bytes, one of the magnetometer 32, one fix 112, one velocity
+    104: 32 MB an hour for Imu and magnetometer at 100 Hz.
+
+    Args:
+        limit: bytes; what comes beyond is counted and dropped.
+        warn: called with a text when something is wrong.
+    """
+
+    def __init__(self, limit, warn=lambda text: None):
+        self.limit = limit
+        self._warn = warn
+        self.clear()
+
+    def clear(self):
+        """Forget everything."""
+        self.dropped = 0
+        self.bad_messages = 0
+        self.bytes = 0
+        self.guards = {topic: Guard() for topic in INPUTS}
+        self._stamps = {topic: array("q") for topic in INPUTS}
+        self._samples = {topic: array("d") for topic in INPUTS}
+        self.frame_ids = {}
+
+    def push(self, topic, cdr):
+        """Take the bytes of one message."""
+        kind, guard = INPUTS[topic], self.guards[topic]
+        try:
+            stamp, frame_id, values = kind.layout.decode(cdr)
+        except MessageError as error:
+            self.bad_messages += 1
+            self._warn(f"{topic}: message left out: {error}")
+            return
+        sample = kind.values(values)
+        epoch = guard.epoch
+        if guard.check(stamp, sample) is not Verdict.OK:
+            return
+        self.frame_ids.setdefault(topic, frame_id)
+        if guard.epoch > epoch:
+            self._warn(f"{topic}: the clock was set back: what was collected before is dropped")
+            self.bytes -= 8 * (1 + kind.width) * len(self._stamps[topic])
+            del self._stamps[topic][:], self._samples[topic][:]
+        size = 8 * (1 + kind.width)
+        if self.bytes + size > self.limit:
+            if not self.dropped:
+                self._warn(f"the collection has reached its limit of {self.limit / 1e6:g} MB: "
+                           "further samples are dropped; see memory_limit and smoother/clear")
+            self.dropped += 1
+            return
+        self.bytes += size
+        self._stamps[topic].append(stamp)
+        self._samples[topic].extend(sample)
+
+    def counts(self):
+        """dict of topic to number of samples held."""
+        return {topic: len(stamps) for topic, stamps in self._stamps.items()}
+
+    def logs(self):
+        """A snapshot: dict of topic to (log, epochs), topics without samples left out.
+
+        Raises:
+            EstimationError: the limit was reached, so that the data have a hole at the end.
+        """
+        if self.dropped:
+            raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
+                                  f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
+                                  "raise memory_limit")
+        logs = {}
+        for topic, kind in INPUTS.items():
+            n = len(self._stamps[topic])
+            if n:
+                stamps = np.array(self._stamps[topic], dtype=np.int64)
+                samples = np.array(self._samples[topic]).reshape(n, kind.width)
+                log = kind.log(stamps, samples, self.frame_ids[topic])
+                logs[topic] = log, np.full(n, self.guards[topic].epoch)
+        return logs
+
+
+def newest_epoch(logs):
+    """The samples since the clock was last set back: dict of topic to log.
+
+    Args:
+        logs: dict of topic to (log, epochs).
+
+    Raises:
+        EstimationError: a topic that is needed has no samples in it.
+    """
+    newest = max((int(epochs[-1]) for _, epochs in logs.values() if len(epochs)), default=0)
+    chosen = {topic: log[epochs == newest] for topic, (log, epochs) in logs.items()}
+    chosen = {topic: log for topic, log in chosen.items() if len(log)}
+    missing = [topic for topic in REQUIRED if topic not in chosen]
+    if missing:
+        raise EstimationError(f"nothing to smooth: no samples on {' and '.join(missing)}"
+                              + (" since the clock was set back" if newest else ""))
+    return chosen
+
+
+def smooth(params, logs):
+    """Smooth collected samples.
+
+    Args:
+        params: SmoothingParams.
+        logs: dict of topic to (log, epochs).
+
+    Returns:
+        SmootherResult
+
+    Raises:
+        ImuFusionError: with the reason, if there is no meaningful result.
+    """
+    chosen = newest_epoch(logs)
+    surface = load_surface(params.surface) if params.surface else None
+    return Smoother(params, surface).run(chosen[IMU_TOPIC], chosen.get(MAG_TOPIC),
+                                         chosen[FIX_TOPIC], chosen.get(VELOCITY_TOPIC))
+
+
+def results(result):
+    """Plain numbers of a SmootherResult, for JSON."""
+    numbers = {"samples": len(result.samples), "iterations": result.iterations,
+               "converged": bool(result.converged), "cost": float(result.cost[-1])}
+    if result.jump is not None:
+        numbers["jump"] = result.jump.to_mapping()
+    return numbers
+
+
+def messages(result, frame_id, path_rate):
+    """Yield (topic, stamp, cdr) of a SmootherResult, in order of stamps, the path last.
+
+    Odometry is in ``world`` (east-north-up at the result's frame) with the twist in the
+    sensor's axes; its orientation covariance is about the fixed axes of the world.
+    """
+    samples = result.samples
+    latitude, longitude, height = result.frame.to_geodetic(samples["position_world"])
+    values = np.zeros(ODOMETRY.size)
+    for i, row in enumerate(samples):
+        stamp = int(row["stamp"])
+        rotation = quat_to_matrix(row["quat_world_imu"])
+        cov_attitude = rotation @ row["cov_attitude"] @ rotation.T
+        pose_cov, twist_cov = np.zeros((6, 6)), np.zeros((6, 6))
+        pose_cov[:3, :3], pose_cov[3:, 3:] = row["cov_position"], cov_attitude
+        twist_cov[:3, :3] = rotation.T @ row["cov_velocity"] @ rotation
+        twist_cov[3:, 3:] = np.diag(row["gyr_bias_sd"] ** 2)
+        values[ODOMETRY["position"]] = row["position_world"]
+        values[ODOMETRY["orientation"]] = row["quat_world_imu"]
+        values[ODOMETRY["pose_covariance"]] = pose_cov.ravel()
+        values[ODOMETRY["linear"]] = rotation.T @ row["vel_world"]
+        values[ODOMETRY["angular"]] = row["gyr"]
+        values[ODOMETRY["twist_covariance"]] = twist_cov.ravel()
+        yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", values, frame_id)
+        yield SMOOTHED_IMU_TOPIC, stamp, imu_message(
+            stamp, frame_id, row["gyr"], row["acc"], row["quat_world_imu"], cov_attitude,
+            np.diag(row["gyr_bias_sd"] ** 2), np.diag(row["acc_bias_sd"] ** 2))
+        yield SMOOTHED_FIX_TOPIC, stamp, fix_message(
+            stamp, frame_id, latitude[i], longitude[i], height[i], row["cov_position"])
+    if len(samples):
+        yield PATH_TOPIC, int(samples["stamp"][-1]), _path(samples, path_rate)
+
+
+def _path(samples, rate):
+    """CDR bytes of a nav_msgs/Path with poses at least 1 / rate apart."""
+    types = TYPES.types
+    header_type, time_type = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+
+    def header(stamp):
+        sec, nanosec = divmod(int(stamp), NANOSECONDS)
+        return header_type(stamp=time_type(sec=sec, nanosec=nanosec), frame_id="world")
+
+    slots = (samples["stamp"] - samples["stamp"][0]) // round(1e9 / rate)
+    first = np.flatnonzero(np.diff(slots, prepend=-1))
+    poses = []
+    for row in samples[first]:
+        pose = types["geometry_msgs/msg/Pose"](
+            position=types["geometry_msgs/msg/Point"](*map(float, row["position_world"])),
+            orientation=types["geometry_msgs/msg/Quaternion"](*map(float, row["quat_world_imu"])))
+        poses.append(types["geometry_msgs/msg/PoseStamped"](header=header(row["stamp"]), pose=pose))
+    path = types[PATH_TYPE](header=header(samples["stamp"][-1]), poses=poses)
+    return bytes(TYPES.serialize_cdr(path, PATH_TYPE))
+
+
+def findings(logs):
+    """What looks wrong with whole logs as recorded: texts."""
+    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC) + checks.check_fix(logs[FIX_TOPIC])
+    if MAG_TOPIC in logs:
+        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
+    return [finding.text for finding in found]
+
+
+def run(logs, report, params):
+    """Batch: the messages that the node publishes after smoothing the same samples."""
+    try:
+        result = smooth(params, logs)
+    except (EstimationError, SampleError) as error:
+        report.skipped = str(error)
+        return
+    report.summary = result.summary()
+    report.results = results(result)
+    yield from messages(result, logs[IMU_TOPIC][0].frame_id, params.path_rate)

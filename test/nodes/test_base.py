@@ -1,0 +1,124 @@
+"""Parameters of nodes from dataclasses, and diagnostics."""
+
+from dataclasses import dataclass
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.exceptions import ParameterUninitializedException
+from rclpy.parameter import Parameter
+
+from imu_fusion.errors import ParameterError, TopicError
+from imu_fusion.nodes.base import Node, message_class
+from imu_fusion.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class Numbers(Parameters):
+    gain: float = param(2.0, doc="a factor", unit="m", low=0, high=10, read_only=False)
+    window: int = param(3, doc="samples", low=1)
+    origin: float | None = param(None, doc="found by itself if unset")
+    axis: tuple[float, ...] = param((0.0, 0.0, 1.0), doc="a direction", length=3)
+    names: tuple[str, ...] = param((), doc="some names")
+    fast: bool = param(False, doc="hurry")
+
+
+@dataclass(frozen=True)
+class More(Parameters):
+    initial__mode: str = param("still", doc="how to start", choices=("still", "given"))
+
+
+class Example(Node):
+    """An example."""
+
+    NAME = "example"
+    PARAMETERS = (Numbers, More)
+
+
+def test_defaults_without_any_parameter(graph):
+    node = graph.start(Example)
+    assert node.params(Numbers) == Numbers() and node.params(More) == More()
+    assert node.get_parameter("gain").value == 2.0
+    assert list(node.get_parameter("axis").value) == [0.0, 0.0, 1.0]
+    assert node.get_parameter("initial.mode").value == "still"
+
+
+def test_given_values_of_both_dataclasses(graph):
+    node = graph.start(Example, gain=4.5, window=7, axis=[1.0, 0.0, 0.0], names=["a", "b"],
+                       fast=True, initial__mode="given", origin=1.5)
+    assert node.params(Numbers) == Numbers(gain=4.5, window=7, axis=(1.0, 0.0, 0.0),
+                                           names=("a", "b"), fast=True, origin=1.5)
+    assert node.params(More).initial__mode == "given"
+    assert node.get_parameter("origin").value == 1.5
+
+
+def test_an_integer_is_a_float_where_one_is_wanted(graph):
+    """`-p gain:=4` is an integer to rcl."""
+    node = graph.start(Example, gain=4, axis=[1, 0, 0])
+    assert node.params(Numbers).gain == 4.0 and isinstance(node.params(Numbers).gain, float)
+    assert node.get_parameter("gain").type_ == Parameter.Type.DOUBLE
+    assert node.params(Numbers).axis == (1.0, 0.0, 0.0)
+
+
+def test_unset_parameters_have_a_type_and_no_value(graph):
+    node = graph.start(Example)
+    with pytest.raises(ParameterUninitializedException):
+        node.get_parameter("origin")
+    assert node.describe_parameter("origin").type == Parameter.Type.DOUBLE.value
+    assert node.params(Numbers).names == ()
+
+
+def test_descriptors_carry_meaning_bounds_and_read_only(graph):
+    node = graph.start(Example)
+    gain = node.describe_parameter("gain")
+    assert gain.description == "a factor [m]" and not gain.read_only
+    assert gain.floating_point_range[0].to_value == 10.0
+    assert node.describe_parameter("window").read_only
+    assert node.describe_parameter("window").integer_range[0].from_value == 1
+
+
+@pytest.mark.parametrize("given, text", [
+    ({"gain": 11.0}, r"'gain' \(from node example\): 11.0 is out of bounds; allowed: 0 to 10 m"),
+    ({"gain": "x"}, "'gain'.*'x' is not a number"),
+    ({"window": 2.5}, "'window'.*2.5 is not an integer"),
+    ({"axis": [1.0, 2.0]}, "'axis'.*has 2 elements"),
+    ({"fast": 1}, "'fast'.*1 is not true or false"),
+    ({"initial__mode": "x"}, "'initial.mode'.*one of still, given"),
+    ({"gian": 1.0}, "unknown parameter 'gian' of node example; known: .*gain"),
+])
+def test_bad_values_are_refused_with_name_value_and_bounds(graph, given, text):
+    with pytest.raises(ParameterError, match=text):
+        graph.start(Example, **given)
+
+
+def test_changes_at_run_time(graph):
+    node = graph.start(Example)
+    assert node.set_parameters([Parameter("gain", value=3.0)])[0].successful
+    assert node.params(Numbers).gain == 3.0
+    refused, = node.set_parameters([Parameter("gain", value=12.0)])
+    assert not refused.successful and node.params(Numbers).gain == 3.0
+    refused, = node.set_parameters([Parameter("window", value=5)])
+    assert not refused.successful and "read-only" in refused.reason
+    assert node.params(Numbers).window == 3
+
+
+def test_use_sim_time_is_left_to_rclpy(graph):
+    node = graph.start(Example, use_sim_time=True)
+    assert node.get_parameter("use_sim_time").value is True
+
+
+def test_diagnostics_carry_the_node_and_its_values(graph):
+    got = []
+    graph.node("monitor").create_subscription(DiagnosticArray, "diagnostics", got.append, 10)
+    node = graph.start(Example)
+    node.start_diagnostics(lambda: (b"\1", "late", {"delay": 0.5}))
+    graph.until(lambda: got)
+    status, = got[0].status
+    assert (status.name, status.level, status.message) == ("example", b"\1", "late")
+    assert [(v.key, v.value) for v in status.values] == [("delay", "0.5")]
+
+
+def test_message_types_by_name():
+    assert message_class("sensor_msgs/msg/Imu").__name__ == "Imu"
+    for name in ("sensor_msgs/msg/Nothing", "nowhere_msgs/msg/Imu", "Imu"):
+        with pytest.raises(TopicError, match=f"message type {name} is not installed"):
+            message_class(name)

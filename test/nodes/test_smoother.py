@@ -1,0 +1,118 @@
+"""The smoother node: collects, smooths in a child, answers, equals batch."""
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry, Path
+from sensor_msgs.msg import Imu, NavSatFix
+from std_srvs.srv import Trigger
+
+from imu_fusion import batch
+from imu_fusion.errors import EstimationError
+from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
+from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
+from imu_fusion.messages.smoothing import OUTPUTS, Collection, newest_epoch
+from imu_fusion.nodes.replayer import Replayer
+from imu_fusion.nodes.smoother import SmootherNode
+from test.nodes.conftest import START, STEP, collector
+
+TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix": NavSatFix,
+          "/smoother/path": Path}
+
+
+def write(path, count=600):
+    """Standing still at Innsbruck for six seconds, then off to the east at 1 m/s^2."""
+    rng = np.random.default_rng(5)
+    with BagWriter(path) as writer:
+        for i in range(count):
+            stamp = START + i * STEP
+            t = max(0.0, (i - 200) * STEP * 1e-9)
+            noise = rng.normal(0, 0.01, 3)
+            force = [1.0 if t else 0.0, 0.0, 9.805]
+            writer.write("/imu/data_raw", IMU.msgtype,
+                         imu_message(stamp, "car", 0.001 * noise, force + noise), stamp)
+            if i % 10 == 0:
+                east = 0.5 * t * t
+                writer.write("/fix", FIX.msgtype, fix_message(
+                    stamp, "gnss", 47.26, 11.39 + np.degrees(east / (6388e3 * np.cos(0.8248))),
+                    600.0, np.eye(3)), stamp)
+                writer.write("/fix_velocity", TWIST.msgtype, velocity_message(
+                    stamp, "world", [t, 0.0, 0.0], 0.01 * np.eye(3)), stamp)
+    return path
+
+
+def fields(topic, cdr):
+    layout = LAYOUTS.get(OUTPUTS[topic.lstrip("/")])
+    if layout is None:
+        return bytes(cdr)  # a Path has no padding: strings end on the boundary of stamps
+    stamp, frame_id, values = layout.decode(cdr)
+    return stamp, frame_id, values.tobytes()
+
+
+def test_service_smooths_what_was_played_and_equals_batch(graph, tmp_path):
+    bag = write(tmp_path / "bag")
+    reports, _ = batch.process(bag, tmp_path / "out", without=["orientation_estimator"])
+    sink = collector(graph, topics=TOPICS)
+    graph.start(SmootherNode, qos="reliable")
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
+    graph.until(lambda: replayer.finished)
+    node = graph.node("client")
+    response = graph.call(node, Trigger, "/smoother/smooth", timeout=120.0)
+    assert response.success, response.message
+    (report,) = [r for r in reports if r.node == "smoother"]
+    assert response.message == report.summary
+    graph.until(lambda: sink.ended)
+    with open_bag(tmp_path / "out") as reader:
+        for topic in TOPICS:
+            assert [fields(topic, c) for c in sink.messages[topic]] == [
+                fields(topic, m[3]) for m in reader.messages([topic])], topic
+    # It did go east: the last odometry is at 0.5 * 3.99^2 m.
+    values = LAYOUTS["nav_msgs/msg/Odometry"].decode(sink.messages["/smoother/odometry"][-1])[2]
+    assert values[0] == pytest.approx(0.5 * 3.99 ** 2, abs=0.5)
+
+
+def test_without_samples_the_answer_is_no_with_the_reason(graph):
+    graph.start(SmootherNode)
+    response = graph.call(graph.node("client"), Trigger, "/smoother/smooth")
+    assert not response.success and "no samples on imu/data_raw and fix" in response.message
+
+
+def test_a_second_call_is_refused_and_clear_empties(graph, tmp_path):
+    bag = write(tmp_path / "bag")
+    smoother = graph.start(SmootherNode, qos="reliable")
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
+    graph.until(lambda: replayer.finished)
+    node = graph.node("client")
+    client = node.create_client(Trigger, "/smoother/smooth")
+    graph.until(client.service_is_ready)
+    first, second = client.call_async(Trigger.Request()), client.call_async(Trigger.Request())
+    graph.until(second.done)
+    assert not second.result().success and "already running" in second.result().message
+    graph.until(first.done, 120.0)
+    assert first.result().success
+    assert smoother._collection.counts()["imu/data_raw"] == 600
+    assert graph.call(node, Trigger, "/smoother/clear").success
+    assert smoother._collection.counts()["imu/data_raw"] == 0
+
+
+def test_collection_is_bounded_and_says_so():
+    said = []
+    collection = Collection(limit=56 * 10, warn=said.append)
+    for i in range(15):
+        collection.push("imu/data_raw", imu_message(START + i * STEP, "car", [0, 0, 0], [0, 0, 9]))
+    assert collection.counts()["imu/data_raw"] == 10 and collection.dropped == 5
+    assert len(said) == 1 and "memory_limit" in said[0]
+    with pytest.raises(EstimationError, match="5 samples were dropped"):
+        collection.logs()
+
+
+def test_a_clock_set_back_drops_what_was_before_it():
+    collection = Collection(limit=1e6)
+    for stamp in (10, 11, 12, 3, 4):
+        collection.push("imu/data_raw",
+                        imu_message(stamp * 10**9, "car", [0, 0, 0], [0, 0, 9]))
+    collection.push("fix", fix_message(11 * 10**9, "gnss", 47.0, 11.0, 600.0))
+    logs = collection.logs()
+    assert list(logs["imu/data_raw"][0].stamp) == [3 * 10**9, 4 * 10**9]
+    with pytest.raises(EstimationError, match="no samples on fix since the clock was set back"):
+        newest_epoch(logs)
