@@ -10,6 +10,7 @@ from sensor_msgs.msg import Imu
 
 from imu_fusion.messages.bag import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.nodes.base import use_fast_heartbeats
 from imu_fusion.nodes.flow import FlowSink
 
 START = 1_700_000_000_000_000_000
@@ -65,6 +66,7 @@ class Graph:
 
 @pytest.fixture
 def graph():
+    use_fast_heartbeats()
     rclpy.init()
     graph = Graph()
     yield graph
