@@ -19,7 +19,7 @@ peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report, *terrain]
 
 nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
-         "acceleration_field_estimator"]
+         "acceleration_field_estimator", "pipeline"]
 
 setup(
     name=package_name,
