@@ -47,7 +47,7 @@ class Graph:
         self.nodes.remove(node)
         node.destroy_node()
 
-    def until(self, condition, timeout=30.0):
+    def until(self, condition, timeout=180.0):  # the first run compiles kernels
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, "the event did not happen"
