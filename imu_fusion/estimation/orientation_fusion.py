@@ -45,7 +45,9 @@ LIMIT = MAG_SUM + MAG_ROWS  # (3,) gyroscope limits found
 REPEATED = LIMIT + 3       # (3,) last value of each axis
 ENTRY = REPEATED + 3       # (3,) step with which it was reached
 LARGEST = ENTRY + 3        # (3,) largest rate seen
-X_SIZE = LARGEST + 3
+SWAY = LARGEST + 3         # (3,) world acceleration through a leaky integral, m/s
+MOTION = SWAY + 3          # mean square of SWAY per axis, (m/s)^2
+X_SIZE = MOTION + 1
 
 # Integer state.
 BLOCK_MAGS = st.K_COMMON
@@ -64,6 +66,8 @@ K_SIZE = WORLD_TURNED + 1
 P_SIZE = st.P_COMMON + 24
 
 _REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
+_SWAY_TIME = 3.0           # s: velocity changes faster than this show in SWAY
+_MOTION_TIME = 10.0        # s: over which the size of the motion is judged
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
 _REST_TURN = 1.5e-3         # rad/s per axis: slower turning than 0.5 deg/s passes as rest
@@ -326,6 +330,16 @@ def _end_block(x, k, par, still, back, tape):
         tape[es.TAPE_MOVE:es.TAPE_MOVE + es.MOVE_SIZE] = move
     es.predict(cov, move)
 
+    # A body that moves more than was said is believed: a vehicle is not held by a hand.
+    motion = 0.0
+    for i in range(3):
+        change = move[es.MOVE_FORCE + i] - (x[GRAVITY] * time if i == 2 else 0.0)
+        x[SWAY + i] = math.exp(-time / _SWAY_TIME) * x[SWAY + i] + par[P_USE_ACC] * change
+        motion += x[SWAY + i] ** 2 / 3.0
+    x[MOTION] += min(time / _MOTION_TIME, 1.0) * (motion - x[MOTION])
+    # At equal accelerations times grow as velocities do, and extents as their square.
+    scale = math.sqrt(max(x[MOTION] / par[P_VEL_SD] ** 2, 1.0))
+
     error = np.zeros(N)
     index = np.empty(es.OP_WIDTH, dtype=np.int64)
     row = np.ones(es.OP_WIDTH)
@@ -336,7 +350,7 @@ def _end_block(x, k, par, still, back, tape):
     for i in range(3):
         index[0] = es.VEL + i
         variance = (_REST_SPEED_SD ** 2 * 0.02 / time if still
-                    else par[P_VEL_SD] ** 2 * max(par[P_VEL_TIME] / time, 1.0))
+                    else scale ** 3 * par[P_VEL_SD] ** 2 * max(par[P_VEL_TIME] / time, 1.0))
         es.update(cov, error, 1, index, row, -x[S + es.VEL + i], variance, tape)
         if still:
             index[0] = es.BIAS + i
@@ -344,7 +358,7 @@ def _end_block(x, k, par, still, back, tape):
                       par[P_REST_RATE_SD] ** 2 * _REST_MEMORY / time, tape)
         index[0] = es.POS + i
         es.update(cov, error, 1, index, row, -x[S + es.POS + i],
-                  par[P_POS_SD] ** 2 * max(par[P_POS_TIME] / time, 1.0), tape)
+                  scale ** 5 * par[P_POS_SD] ** 2 * max(par[P_POS_TIME] / time, 1.0), tape)
     if k[BLOCK_MAGS] > 0:
         _update_mag(x, k, par, error, still, tape)
 
