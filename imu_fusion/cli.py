@@ -107,6 +107,30 @@ def process(bag, out, params_file, without, remap, overwrite):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
+@click.option("--without", multiple=True, metavar="NODE", help="Leave an estimator out. Repeatable.")
+@click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
+@remap_option
+@overwrite_option
+def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
+    """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
+
+    Each node is a process of an own ROS domain. OUT holds what was played and the estimates,
+    the same as those of `process`.
+    """
+    from imu_fusion import pipeline as nodes
+    nodes.run(bag, out, params_file, without, _remaps(remap), overwrite)
+    click.echo(f"written: {out}")
+    if with_report:
+        from imu_fusion.report.recording import write_recording_report
+        path = Path(out) / "report.html"
+        write_recording_report(out, out, path, params_file)
+        click.echo(f"written: {path}")
+
+
+@cli.command()
+@click.argument("bag", type=click.Path())
 @click.option("--repair", "target", type=click.Path(), metavar="OUT",
               help="Copy all that can be read into a clean recording OUT.")
 def info(bag, target):
@@ -139,13 +163,24 @@ def _number(value, form):
 @click.argument("source", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
+@click.option("--csv", "description", type=click.Path(), metavar="YAML",
+              help="SOURCE is a table of accelerometers; YAML names its columns, units, positions "
+                   "and axes.")
 @remap_option
 @overwrite_option
-def convert(source, out, topics, remap, overwrite):
+def convert(source, out, topics, description, remap, overwrite):
     """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
 
-    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT.
+    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With --csv
+    SOURCE is a table, and OUT.yaml becomes the parameter file that process takes.
     """
+    if description is not None:
+        if topics or remap:
+            raise click.UsageError("--csv goes without --topic and --remap")
+        from imu_fusion.messages.csv_import import import_csv
+        parameter_file, count = import_csv(source, description, out, overwrite)
+        click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
+        return
     from imu_fusion.messages.bag import BagWriter, open_bag
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:

@@ -34,7 +34,7 @@ S = st.X_COMMON            # (N,) nominal values of the slow states, velocity, p
 COV = S + N                # (N, N)
 NORM = COV + N * N         # field norm, tesla; 0 before the first sample
 GRAVITY = NORM + 1         # m/s^2
-HEADING_VAR = NORM + 2     # rad^2, of the heading against true north; not observable later
+HEADING_VAR = NORM + 2     # rad^2, of a heading that no magnetometer has fixed
 ACC_LAST = NORM + 3        # (3,)
 MEAN_RATE = NORM + 6       # (3,) low-passed raw rate, for the rest detector
 MEAN_FORCE = NORM + 9      # (3,)
@@ -60,12 +60,14 @@ K_SIZE = WORLD_TURNED + 1
 (P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,
  P_FIELD_WALK, P_MAG_RELATIVE, P_NORM_FACTOR, P_REST_RATE, P_REST_FORCE, P_REST_TIME,
  P_REST_RATE_SD, P_EXCESS_WALK, P_ESTIMATE_BIAS, P_SCALE_SD, P_OFFSET_SD, P_SOFT_SD,
- P_LAG_SD) = range(st.P_COMMON, st.P_COMMON + 21)
-P_SIZE = st.P_COMMON + 21
+ P_LAG_SD, P_FOLLOW_FIELD, P_HEADING_SD, P_USE_ACC) = range(st.P_COMMON, st.P_COMMON + 24)
+P_SIZE = st.P_COMMON + 24
 
 _REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
+_REST_TURN = 1.5e-3         # rad/s per axis: slower turning than 0.5 deg/s passes as rest
+_FIRST_FIELD_SD = 2e-3     # relative: noise of the field that the alignment averages
 _BURST_SHARE = 0.5         # of the block, while an axis is at its limit
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
 _ENTRY_SHARE = 2e-3        # a flat top is run into; a quantised smooth peak is not
@@ -79,7 +81,8 @@ def pack(par, p):
         p.position_time, p.local_field_sd, p.local_field_time, p.field_walk, p.mag_sd,
         p.norm_deviation_factor, p.rest_rate, p.rest_force, p.rest_time, p.rest_rate_sd,
         p.saturation_walk, p.estimate_bias, p.gyr_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
-        p.mag_delay_sd if p.mag_delay is None else 0.0)
+        p.mag_delay_sd if p.mag_delay is None else 0.0, p.heading_anchor == "field",
+        math.radians(p.heading_sd_deg), p.use_acc)
 
 
 def initialise(x, k, par, a):
@@ -89,7 +92,7 @@ def initialise(x, k, par, a):
     x[S + es.BIAS:S + es.BIAS + 3] = x[st.GYR_BIAS:st.GYR_BIAS + 3] = a.gyr_bias
     x[S + es.LAG] = x[st.LAG]
     x[GRAVITY] = a.gravity
-    x[HEADING_VAR] = a.cov_attitude_world[2, 2]
+    x[HEADING_VAR] = st.UNIFORM_VARIANCE
     x[MEAN_RATE:MEAN_RATE + 3] = a.gyr_bias
     x[LIMIT:LIMIT + 3] = np.where(np.isnan(par[st.P_RANGE:st.P_RANGE + 3]), np.inf,
                                   par[st.P_RANGE:st.P_RANGE + 3])
@@ -104,50 +107,66 @@ def initialise(x, k, par, a):
     sd[es.LAG] = par[P_LAG_SD]
     sd[es.SOFT:es.EXCESS] = par[P_SOFT_SD]
     x[COV:COV + N * N] = np.diag(sd ** 2).ravel()
-    k[st.HEADING_KNOWN] = a.has_heading
     if a.field_world is not None:
-        _start_field(x, par, a.field_world)
+        follow = 1.0 if par[P_FOLLOW_FIELD] or not a.at_rest else 0.0
+        _start_field(x, k, par, a.field_world, a.has_heading, follow)
 
 
 @njit(cache=True)
-def _start_field(x, par, field):
-    """Begin the field states with ``field`` (3,) tesla, measured here and now, world axes.
+def _start_field(x, k, par, z, has_heading, follow):
+    """Begin the field states with ``z`` (3,) tesla, measured here and now, world axes.
 
-    field = z - local - [z]x dtheta: the first field shares the tilt's error. Heading has
-    none by definition: it is what the field says; its error against true north is
-    kept apart.
+    The first sample makes the field share the tilt's error. With ``has_heading`` the
+    heading has no error but a constant one, or with ``follow`` = 1 one that is known as well
+    as tilt and calibration, and is corrected when these are.
     """
     cov = x[COV:COV + N * N].reshape(N, N)
-    x[NORM] = math.sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
-    b = field / x[NORM]
+    x[NORM] = math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2)
+    b = z / x[NORM]
     x[S + es.FIELD:S + es.FIELD + 3] = b
-    local = par[P_LOCAL_SD] ** 2
+    for i in range(es.FIELD, es.OFFSET):
+        cov[i, :] = 0.0
+        cov[:, i] = 0.0
+        cov[i, i] = 1.0 if i < es.LOCAL else par[P_LOCAL_SD] ** 2
+    if has_heading:
+        cov[es.ATT + 2, es.ATT + 2] += follow
+        x[HEADING_VAR] = par[P_HEADING_SD] ** 2 * (1.0 - follow)
+        k[st.HEADING_KNOWN] = 1
+    quat = x[st.Q:st.Q + 4]
+    r = quat_to_matrix(quat)
+    m = quat_rotate_inverse(quat, b)
+    index = np.empty(es.OP_WIDTH, dtype=np.int64)
+    row = np.empty(es.OP_WIDTH)
+    error = np.zeros(N)
     for i in range(3):
-        for j in range(N):
-            cov[es.FIELD + i, j] = 0.0
-            cov[j, es.FIELD + i] = 0.0
-            cov[es.LOCAL + i, j] = 0.0
-            cov[j, es.LOCAL + i] = 0.0
-    for i in range(3):
-        j, m = (i + 1) % 3, (i + 2) % 3
-        for c in range(N):
-            # row i of -[b]x: dtheta_m b_j with a minus, dtheta_j b_m
-            cov[es.FIELD + i, c] = -b[j] * cov[es.ATT + m, c] + b[m] * cov[es.ATT + j, c]
-    for i in range(3):
-        for c in range(N):
-            if c < es.FIELD or c >= es.LOCAL:
-                cov[c, es.FIELD + i] = cov[es.FIELD + i, c]
-    for i in range(3):
-        # [b]x P [b]x' from the attitude columns just written
-        row = cov[es.FIELD + i, es.ATT:es.ATT + 3].copy()
+        _mag_row(i, b, index, row)
+        row[4] = 0.0
         for c in range(3):
-            j, m = (c + 1) % 3, (c + 2) % 3
-            cov[es.FIELD + i, es.FIELD + c] = -b[j] * row[m] + b[m] * row[j]
-    for i in range(3):
-        cov[es.LOCAL + i, es.LOCAL + i] = local
-        cov[es.FIELD + i, es.LOCAL + i] = -local
-        cov[es.LOCAL + i, es.FIELD + i] = -local
-        cov[es.FIELD + i, es.FIELD + i] += local + 1e-5
+            row[5 + c] = r[i, c] * follow
+            for d in range(3):
+                row[8 + 3 * c + d] = r[i, c] * m[d] * follow
+        es.update(cov, error, 17, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+    if has_heading and follow:
+        for c in range(2):
+            index[c], index[2 + c] = es.FIELD + c, es.LOCAL + c
+        row[0] = row[2] = math.cos(par[st.P_DECLINATION])
+        row[1] = row[3] = -math.sin(par[st.P_DECLINATION])
+        es.update(cov, error, 4, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+
+
+@njit(cache=True)
+def _mag_row(i, field, index, row):
+    """Row i of the magnetometer's measurement: attitude, field and local; indices of all."""
+    j, m = (i + 1) % 3, (i + 2) % 3
+    index[0], row[0] = es.ATT + m, field[j]
+    index[1], row[1] = es.ATT + j, -field[m]
+    index[2], row[2] = es.FIELD + i, 1.0
+    index[3], row[3] = es.LOCAL + i, 1.0
+    index[4] = es.LAG
+    for c in range(3):
+        index[5 + c] = es.OFFSET + c
+    for c in range(9):
+        index[8 + c] = es.SOFT + c
 
 
 @njit(cache=True)
@@ -157,7 +176,7 @@ def _fix_heading(x, k, par, z):
     horizontal = math.hypot(z[0], z[1])
     norm = math.sqrt(horizontal ** 2 + z[2] ** 2)
     if horizontal < 0.02 * norm:
-        _start_field(x, par, z)
+        _start_field(x, k, par, z, False, 0.0)
         return
     # The needle points to azimuth D: east sin D, north cos D.
     angle = 0.5 * math.pi - par[st.P_DECLINATION] - math.atan2(z[1], z[0])
@@ -170,10 +189,8 @@ def _fix_heading(x, k, par, z):
             cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j].copy())
         for j in range(N):
             cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3].copy())
-    x[HEADING_VAR] = ((par[P_MAG_RELATIVE] ** 2 + par[P_LOCAL_SD] ** 2)
-                      * (norm / horizontal) ** 2)
-    k[st.HEADING_KNOWN] = 1
-    _start_field(x, par, quat_rotate(turn, z))
+    # The sensor may be moving: what it shows now is no anchor.
+    _start_field(x, k, par, quat_rotate(turn, z), True, 1.0)
 
 
 @njit(cache=True)
@@ -270,16 +287,12 @@ def _update_mag(x, k, par, error, still, tape):
     index = np.empty(es.OP_WIDTH, dtype=np.int64)
     row = np.empty(es.OP_WIDTH)
     for i in range(3):
-        j, m = (i + 1) % 3, (i + 2) % 3
-        index[0], row[0] = es.ATT + m, expected[j]
-        index[1], row[1] = es.ATT + j, -expected[m]
-        index[2], row[2] = es.FIELD + i, 1.0
-        index[3], row[3] = es.LOCAL + i, 1.0
-        index[4], row[4] = es.LAG, x[lag_row + i] / count
+        _mag_row(i, expected, index, row)
+        row[4] = x[lag_row + i] / count
         for c in range(3):
-            index[5 + c], row[5 + c] = es.OFFSET + c, x[offset_row + 3 * i + c] / count
+            row[5 + c] = x[offset_row + 3 * i + c] / count
         for c in range(9):
-            index[8 + c], row[8 + c] = es.SOFT + c, x[soft_row + 9 * i + c] / count
+            row[8 + c] = x[soft_row + 9 * i + c] / count
         es.update(cov, error, 17, index, row, z[i] - expected[i], variance, tape)
 
 
@@ -382,7 +395,7 @@ def _is_still(x, k, par, stamp, dt, gyr, acc):
         force2 += (acc[i] - x[MEAN_FORCE + i]) ** 2
         mean2 += (x[MEAN_RATE + i] - x[S + es.BIAS + i]) ** 2
         slot = COV + (es.BIAS + i) * (N + 1)
-        limit2 += x[slot] + par[P_REST_RATE_SD] ** 2
+        limit2 += x[slot] + _REST_TURN ** 2
     if (rate2 > par[P_REST_RATE] ** 2 or force2 > par[P_REST_FORCE] ** 2
             or mean2 > 9.0 * limit2):
         k[REST_SINCE] = stamp
@@ -423,7 +436,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()
     raw = 0.5 * (last + gyr)
-    phi = _rate(x, raw) * dt
+    phi = st.rotation_of_step(_rate(x, last), _rate(x, gyr), dt)
     middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(0.5 * phi)))
     x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], quat_exp(phi)))
     k[st.LAST_STAMP] = stamp
@@ -438,8 +451,10 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
                 move[es.MOVE_EXCESS + 3 * i + j] += middle[i, j] * dt
             for c in range(3):
                 move[es.MOVE_SCALE + 9 * i + 3 * j + c] += middle[i, j] * raw[c] * dt
-        move[es.MOVE_FORCE + i] += force * dt
-        change = (force - (x[GRAVITY] if i == 2 else 0.0)) * dt
+        change = 0.0
+        if par[P_USE_ACC]:
+            move[es.MOVE_FORCE + i] += force * dt
+            change = (force - (x[GRAVITY] if i == 2 else 0.0)) * dt
         x[S + es.POS + i] += (x[S + es.VEL + i] + 0.5 * change) * dt
         x[S + es.VEL + i] += change
     move[es.MOVE_TIME] += dt

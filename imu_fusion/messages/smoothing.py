@@ -244,7 +244,7 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def run(params, logs, report):
+def run(logs, report, params):
     """Batch: the messages that the node publishes after smoothing the same samples."""
     try:
         result = smooth(params, logs)
