@@ -15,7 +15,7 @@ from imu_fusion.estimation.orientation_error import (moving_at, orientation_erro
 from imu_fusion.graph import Graph
 from imu_fusion.messages.bag import open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
-from imu_fusion.report.recording import write_orientation_report
+from imu_fusion.report.recording import write_recording_report
 
 
 def bags_directory():
@@ -54,7 +54,7 @@ def orientation(out, console):
         errors, moving = compare(played, recorded)
     console.print(_error_table(errors, moving))
     report = out / "report.html"
-    write_orientation_report(bag, recording, report)
+    write_recording_report(bag, recording, report)
     console.print(f"{duration:.0f} s of data in {elapsed:.0f} s through three ROS 2 processes "
                   f"(domain {graph.domain})\nrecording: {recording}\nreport:    {report}")
 
