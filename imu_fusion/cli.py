@@ -252,7 +252,11 @@ def report(bag, estimates, params_file, out):
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,
               help="Directory for recording and report.")
 def demo(name, out):
-    """Play a real recording through the nodes, record, compare, report."""
+    """Play a recording through the nodes, record, compare with the truth, report.
+
+    NAME: orientation (a sensor turned by hand), drive (a car, GNSS withheld for a while) or
+    jump (a simulated ski jump).
+    """
     from imu_fusion import demos
     demos.run(name, out, console)
 

@@ -1,15 +1,14 @@
-"""``imu_fusion demo``: the main job on a real recording, through real ROS 2 nodes."""
+"""``imu_fusion demo``: the main jobs on recordings, through real ROS 2 nodes."""
 
-import os
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
-import imu_fusion
-from imu_fusion.errors import BagError, ParameterError
+from imu_fusion import demos_trajectory as trajectory
+from imu_fusion.demos_trajectory import shared
+from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.orientation_error import (moving_at, orientation_errors, shares_within,
                                                      statistics)
 from imu_fusion.graph import Graph
@@ -18,25 +17,9 @@ from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.report.recording import write_recording_report
 
 
-def bags_directory():
-    """Where the recordings of the package are: in the checkout, or installed under share/.
-
-    Raises:
-        BagError: neither is there.
-    """
-    prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
-    candidates = [Path(imu_fusion.__file__).parent.parent / "bags"]
-    candidates += [Path(prefix) / "share" / "imu_fusion" / "bags" for prefix in prefixes if prefix]
-    for candidate in candidates:
-        if candidate.is_dir():
-            return candidate
-    raise BagError("the recordings of the demo are not installed; looked in "
-                   + ", ".join(map(str, candidates)))
-
-
 def orientation(out, console):
     """Play a BROAD trial through replayer, orientation_estimator and recorder."""
-    bag = bags_directory() / "broad_06_fast_rotation"
+    bag = shared("bags") / "broad_06_fast_rotation"
     recording = out / "recording"
     started = time.monotonic()
     with Graph(out / "logs") as graph:
@@ -99,7 +82,7 @@ def _error_table(errors, moving):
     return table
 
 
-DEMOS = {"orientation": orientation}
+DEMOS = {"orientation": orientation, "drive": trajectory.drive, "jump": trajectory.jump}
 
 
 def run(name, out, console):

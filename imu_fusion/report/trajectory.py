@@ -77,7 +77,7 @@ def _side_view(position_world):
     _, directions = np.linalg.eigh(centred.T @ centred)
     across = directions[:, 0]
     across = across if across[1] < 0 else -across
-    return float(1.25 * across[0]), float(1.25 * across[1]), 0.6
+    return float(1.5 * across[0]), float(1.5 * across[1]), 0.7
 
 
 def _xyz(points):
