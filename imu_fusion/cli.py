@@ -220,12 +220,15 @@ def _ros_args(**values):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
-@click.option("--estimates", type=click.Path(), help="Recording with imu/data, if not in BAG.")
+@click.option("--estimates", type=click.Path(),
+              help="Recording with imu/data or acceleration_field/*, if not in BAG.")
+@click.option("--params-file", type=click.Path(),
+              help="Parameter file: places of accelerometers and query points.")
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
-def report(bag, estimates, out):
+def report(bag, estimates, params_file, out):
     """Write an HTML report of BAG and its estimates, with a reference if BAG has one."""
     from imu_fusion.report.recording import write_orientation_report
-    write_orientation_report(bag, estimates or bag, out)
+    write_orientation_report(bag, estimates or bag, out, params_file)
     click.echo(f"written: {out}")
 
 

@@ -13,6 +13,8 @@ from imu_fusion.messages.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
+from imu_fusion.report.acceleration_field import field_sections
+from imu_fusion.report.field_data import read_field
 from imu_fusion.report.figures import intervals
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import Notes, Section, Text, write_report
@@ -76,15 +78,17 @@ def read_estimates(path):
         return _usable(read_log(reader, ESTIMATES, attitude_log), ESTIMATES, warnings), warnings
 
 
-def write_orientation_report(bag, estimates, path):
+def write_orientation_report(bag, estimates, path, params_file=None):
     """Write the HTML report of a recording.
 
     Args:
         bag: recording with sensor topics and perhaps ``reference/pose``; another PoseStamped
             topic is used in its place if there is no such topic.
         estimates: recording with ``imu/data``, may be the same; if it has none, the report is
-            about the recording alone.
+            about the recording alone. ``acceleration_field/*`` in it get their sections, too.
         path: HTML file to write.
+        params_file: parameter file of the acceleration field estimator: where the
+            accelerometers and the query points are.
 
     Raises:
         BagError, TopicError: a recording cannot be read, or holds nothing to report about.
@@ -116,7 +120,8 @@ def write_orientation_report(bag, estimates, path):
                           findings, is_truth)]
     if warnings:
         blocks.append(Notes(tuple(warnings)))
-    if estimate is None:
+    field = read_field(bag, estimates, params_file)
+    if estimate is None and field is None:
         blocks.append(Text(f"{Path(estimates).name} holds no estimates on {ESTIMATES}: this "
                            "report is about the recording alone. imu_fusion process makes them."))
     elif errors is not None:
@@ -131,6 +136,8 @@ def write_orientation_report(bag, estimates, path):
     if errors is not None:
         sections.append(error_section(errors, origin, moving, contents.reference_name, is_truth,
                                       shaded))
+    if field is not None:
+        sections += field_sections(field, origin)
     if estimate is not None and mag is not None:
         sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
     if raw is not None or estimate is not None:
