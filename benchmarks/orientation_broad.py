@@ -130,14 +130,6 @@ def main():
                      " ".join(f"{v:.1f}" for v in delayed[:, 0]), share])
         print(rows[-1], flush=True)
 
-    for name, run in [("Madgwick (ahrs)", madgwick), ("Mahony (ahrs)", mahony),
-                      ("imufusion", fusion), ("VQF", vqf), ("OfflineVQF", offline_vqf)]:
-        add(name, "defaults", score(run, 0), score(run, 1))
-    grid = list(itertools.product((1.5, 3.0, 5.0), (9.0, 25.0, 70.0)))
-    for name, run in [("VQF", vqf), ("OfflineVQF", offline_vqf)]:
-        add(name, "leave one out", *(leave_one_out(np.array(
-            [score(lambda i, m, s=s: run(i, m, *s), d) for s in grid])) for d in (0, 1)))
-
     # Ours takes the gyroscope's delay as its parameter and finds the magnetometer's itself,
     # so it always gets the recordings as they are.
     def mine(**changes):
@@ -149,6 +141,9 @@ def main():
         return errors, share
 
     for name, changes in [("gyro_mag (Winkler 2025)", dict(method="gyro_mag")),
+                          ("fusion, causal, use_acc false", dict(use_acc=False)),
+                          ("fusion, smoothed, use_acc false",
+                           dict(use_acc=False, mode="smoothed")),
                           ("fusion, causal", {}), ("fusion, smoothed", dict(mode="smoothed"))]:
         delays = dict(gyr_delay=GYR_DELAY)
         if name.startswith("gyro_mag"):
@@ -156,7 +151,7 @@ def main():
         plain, _ = mine(**changes)
         errors, share = mine(**changes, **delays)
         add(name, "defaults", plain, errors, f"{100 * share:.0f} %")
-        if "method" in changes:
+        if "method" in changes or "use_acc" in changes:
             continue
         default = OrientationParams()
         sets = [{}] + [{name: scale} for name in ("velocity_walk", "mag_sd")
@@ -164,6 +159,14 @@ def main():
         tuned = leave_one_out(np.array([mine(**changes, **delays, **{
             k: getattr(default, k) * v for k, v in s.items()})[0] for s in sets]))
         add(name, "leave one out", None, tuned)
+
+    for name, run in [("Madgwick (ahrs)", madgwick), ("Mahony (ahrs)", mahony),
+                      ("imufusion", fusion), ("VQF", vqf), ("OfflineVQF", offline_vqf)]:
+        add(name, "defaults", score(run, 0), score(run, 1))
+    grid = list(itertools.product((1.5, 3.0, 5.0), (9.0, 25.0, 70.0)))
+    for name, run in [("VQF", vqf), ("OfflineVQF", offline_vqf)]:
+        add(name, "leave one out", *(leave_one_out(np.array(
+            [score(lambda i, m, s=s: run(i, m, *s), d) for s in grid])) for d in (0, 1)))
 
     names = " ".join(path.name[:2] for path in broad_trials())
     write_table("orientation_broad", [

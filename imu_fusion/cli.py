@@ -107,6 +107,30 @@ def process(bag, out, params_file, without, remap, overwrite):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
+@click.option("--without", multiple=True, metavar="NODE", help="Leave an estimator out. Repeatable.")
+@click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
+@remap_option
+@overwrite_option
+def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
+    """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
+
+    Each node is a process of an own ROS domain. OUT holds what was played and the estimates,
+    the same as those of `process`.
+    """
+    from imu_fusion import pipeline as nodes
+    nodes.run(bag, out, params_file, without, _remaps(remap), overwrite)
+    click.echo(f"written: {out}")
+    if with_report:
+        from imu_fusion.report.recording import write_recording_report
+        path = Path(out) / "report.html"
+        write_recording_report(out, out, path, params_file)
+        click.echo(f"written: {path}")
+
+
+@cli.command()
+@click.argument("bag", type=click.Path())
 @click.option("--repair", "target", type=click.Path(), metavar="OUT",
               help="Copy all that can be read into a clean recording OUT.")
 def info(bag, target):

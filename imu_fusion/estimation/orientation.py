@@ -94,6 +94,8 @@ class OrientationParams(Parameters):
                                 doc="Standard deviation of gyroscope scale and misalignment.")
     estimate_bias: bool = param(True, doc="Whether gyroscope bias and scale are estimated.",
                                 read_only=False)
+    use_acc: bool = param(
+        True, doc="fusion: whether the accelerometer is used after the start.")
     velocity_walk: float = param(0.1, unit="m/s^2/sqrt(Hz)", low=0,
                                  doc="What the specific force does not tell of the motion.")
     velocity_sd: float = param(0.6, unit="m/s", low=1e-3,

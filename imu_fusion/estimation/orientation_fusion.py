@@ -60,8 +60,8 @@ K_SIZE = WORLD_TURNED + 1
 (P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,
  P_FIELD_WALK, P_MAG_RELATIVE, P_NORM_FACTOR, P_REST_RATE, P_REST_FORCE, P_REST_TIME,
  P_REST_RATE_SD, P_EXCESS_WALK, P_ESTIMATE_BIAS, P_SCALE_SD, P_OFFSET_SD, P_SOFT_SD,
- P_LAG_SD, P_FOLLOW_FIELD, P_HEADING_SD) = range(st.P_COMMON, st.P_COMMON + 23)
-P_SIZE = st.P_COMMON + 23
+ P_LAG_SD, P_FOLLOW_FIELD, P_HEADING_SD, P_USE_ACC) = range(st.P_COMMON, st.P_COMMON + 24)
+P_SIZE = st.P_COMMON + 24
 
 _REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
@@ -82,7 +82,7 @@ def pack(par, p):
         p.norm_deviation_factor, p.rest_rate, p.rest_force, p.rest_time, p.rest_rate_sd,
         p.saturation_walk, p.estimate_bias, p.gyr_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
         p.mag_delay_sd if p.mag_delay is None else 0.0, p.heading_anchor == "field",
-        math.radians(p.heading_sd_deg))
+        math.radians(p.heading_sd_deg), p.use_acc)
 
 
 def initialise(x, k, par, a):
@@ -451,8 +451,10 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
                 move[es.MOVE_EXCESS + 3 * i + j] += middle[i, j] * dt
             for c in range(3):
                 move[es.MOVE_SCALE + 9 * i + 3 * j + c] += middle[i, j] * raw[c] * dt
-        move[es.MOVE_FORCE + i] += force * dt
-        change = (force - (x[GRAVITY] if i == 2 else 0.0)) * dt
+        change = 0.0
+        if par[P_USE_ACC]:
+            move[es.MOVE_FORCE + i] += force * dt
+            change = (force - (x[GRAVITY] if i == 2 else 0.0)) * dt
         x[S + es.POS + i] += (x[S + es.VEL + i] + 0.5 * change) * dt
         x[S + es.VEL + i] += change
     move[es.MOVE_TIME] += dt

@@ -164,6 +164,17 @@ def test_slow_turning_is_not_taken_for_bias():
     assert not (rows["flags"][1200:] & FLAG_STILL).any()
 
 
+def test_without_the_accelerometer_impacts_do_no_harm(ordinary):
+    imu, mag, truth, _ = ordinary
+    shaken = imu.acc.copy()
+    shaken[600:] = np.random.default_rng(0).normal(0, 100.0, shaken[600:].shape)
+    rows = OrientationEstimator(OrientationParams(use_acc=False)).run(
+        ImuLog(imu.stamp, imu.gyr, shaken), mag)
+    same = OrientationEstimator(OrientationParams(use_acc=False)).run(imu, mag)
+    assert rmse_deg(rows, truth) < 3.0
+    assert rmse_deg(same, truth) == pytest.approx(rmse_deg(rows, truth), abs=0.3)
+
+
 def test_start_in_motion(ordinary):
     imu, mag, truth, _ = ordinary
     begin = imu.stamp[0] + int(8e9)

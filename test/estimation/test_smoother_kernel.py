@@ -230,10 +230,10 @@ def test_segments_change_nothing(monkeypatch):
                         np.zeros((len(m), 3)), False, np.empty((0, 3, 3, 3)),
                         np.empty((0, n - 9)))
     # One segment as long as the whole.
-    storage = kernel._storage(count, 3 * len(m), n)
+    storage = kernel.make_storage(count, 3 * len(m), n)
     delta, cov, step = np.zeros(n), np.eye(n), np.empty((count, n))
     kernel.filter_segment(0, count, False, x, delta, cov, motion, measured, rows,
-                          np.zeros((len(m), 3)), True, storage)
+                          np.zeros((len(m), 3)), storage)
     kernel.smooth_segment(0, count, x, np.zeros(n), np.zeros((n, n)), motion, storage, False,
                           step, np.empty((0, 3, 3, 3)), np.empty((0, n - 9)))
     kernel.apply_step(x, step, np.zeros(3))

@@ -66,8 +66,10 @@ class Problem:
         """Extended Kalman filter over the first ``count`` samples; writes x."""
         self.x[0] = self.prior
         count = len(self.x) if count is None else count
-        cost = kernel.follow(self.x, count, np.diag(self.prior_sd ** 2), self.motion,
-                             self.attached, self.rows, self.innovation)
+        n = self.size
+        cost = kernel.filter_segment(
+            0, count, True, self.x, np.zeros(n), np.diag(self.prior_sd ** 2), self.motion,
+            self.attached, self.rows, self.innovation, kernel.make_storage(0, 0, n))
         # A heading is judged by what the filter did not expect, not by what it ended with.
         start = self.attached[0]
         squares = (self.innovation[:start[count]] ** 2).sum(axis=1)

@@ -115,7 +115,7 @@ def _slow_noise(walk, rate, dt, factor):
 
 @njit(cache=True)
 def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, innovation,
-                   store, storage):
+                   storage):
     """Filter samples first <= k < last; ``delta`` and ``cov`` are those before the rows of
     ``first`` on entry, before the rows of ``last`` on return.
 
@@ -131,8 +131,9 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             (M, 3, 3), squared scale of the robust loss (0: squared loss).
         rows: constraints sorted by sample: start (N + 1,), residual, gradient, sigma, height.
         innovation: (M, 3) normalised innovations, result.
-        store: whether to fill ``storage`` for the backward pass: entries, indices, count, gain,
-            value and start of the rows; deviation and covariance after the rows.
+        storage: what the backward pass needs (:func:`make_storage`): entries, indices, count,
+            gain, value and start of the rows; deviation and covariance after the rows. Filled
+            unless it was made for no sample.
 
     Returns:
         Sum of the losses of all rows at the nominal trajectory.
@@ -141,6 +142,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
     m_start, m_kind, m_tau, m_value, m_whiten, m_loss = measured
     c_start, c_residual, c_gradient, c_sigma, c_height = rows
     (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
+    store = len(s_delta) > 0
     n = len(delta)
     n_total = len(x)
     f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
@@ -454,15 +456,8 @@ def apply_step(x, step, largest):
 
 
 @njit(cache=True)
-def follow(x, count, cov, motion, measured, rows, innovation):
-    """Extended Kalman filter over the first ``count`` samples from x[0]; writes x."""
-    n = len(cov)
-    return filter_segment(0, count, True, x, np.zeros(n), cov, motion, measured, rows,
-                          innovation, False, _storage(0, 0, n))
-
-
-@njit(cache=True)
-def _storage(n_samples, n_rows, n):
+def make_storage(n_samples, n_rows, n):
+    """Arrays for a segment of n_samples with n_rows rows and n error states."""
     return (np.empty((n_rows, MAX_ENTRIES)), np.empty((n_rows, MAX_ENTRIES), np.int64),
             np.empty(n_rows, np.int64), np.empty((n_rows, n)), np.empty(n_rows),
             np.empty(n_samples + 1, np.int64), np.empty((n_samples, n)),
@@ -485,21 +480,23 @@ def solve_linear(x, delta, cov, motion, measured, rows, innovation, with_cov, co
     count = (total + SEGMENT - 1) // SEGMENT
     kept_delta, kept_cov = np.empty((count, n)), np.empty((count, n, n))
     most, cost, process = 0, 0.0, 0.0
-    nothing = _storage(0, 0, n)
+    # A constant would have the filter compiled a second time for it.
+    follow = np.zeros(1, np.bool_)[0]
+    nothing = make_storage(0, 0, n)
     for s in range(count):
         first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
         kept_delta[s], kept_cov[s] = delta, cov
         most = max(most, 3 * (measured[0][last] - measured[0][first])
                    + rows[0][last] - rows[0][first])
-        cost += filter_segment(first, last, False, x, delta, cov, motion, measured, rows,
-                               innovation, False, nothing)
-    storage = _storage(SEGMENT, most, n)
+        cost += filter_segment(first, last, follow, x, delta, cov, motion, measured, rows,
+                               innovation, nothing)
+    storage = make_storage(SEGMENT, most, n)
     step, largest = np.empty((SEGMENT, n)), np.zeros(3)
     adjoint, adjoint_cov = np.zeros(n), np.zeros((n, n))
     for s in range(count - 1, -1, -1):
         first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
-        filter_segment(first, last, False, x, kept_delta[s], kept_cov[s], motion, measured,
-                       rows, innovation, True, storage)
+        filter_segment(first, last, follow, x, kept_delta[s], kept_cov[s], motion, measured,
+                       rows, innovation, storage)
         process += smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage,
                                   with_cov, step, cov_out, var_out)
         apply_step(x[first:last], step, largest)
