@@ -244,7 +244,8 @@ def _ros_args(**values):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
-@click.option("--estimates", type=click.Path(), help="Recording with imu/data, if not in BAG.")
+@click.option("--estimates", type=click.Path(),
+              help="Recording with imu/data or acceleration_field/*, if not in BAG.")
 @click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
 def report(bag, estimates, params_file, out):
