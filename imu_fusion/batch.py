@@ -99,11 +99,20 @@ def stages():
     )}
 
 
-def _configure_field(stage, params_file):
-    values = node_values(stage.node, params_file, field_stream.FieldConfiguration.names())
+def field_configuration(params_file):
+    """The FieldConfiguration of the acceleration field estimator in a parameter file (or None).
+
+    Raises:
+        ParameterError, LayoutError: with the name of what is wrong.
+    """
+    values = node_values(field_stream.NODE, params_file, field_stream.FieldConfiguration.names())
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
-    config = field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
+    return field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
+
+
+def _configure_field(stage, params_file):
+    config = field_configuration(params_file)
     gyroscope = [field_stream.GYROSCOPE_TOPIC] * (config.gyroscope is not None)
     return replace(
         stage, kinds=config.inputs, optional=_types(config.inputs, gyroscope),
