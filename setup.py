@@ -18,7 +18,8 @@ terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report, *terrain]
 
-nodes = ["replayer", "recorder", "orientation_estimator", "smoother", "pipeline"]
+nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
+         "acceleration_field_estimator", "pipeline"]
 
 setup(
     name=package_name,
@@ -51,6 +52,6 @@ setup(
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
     ]},
-    package_data={"imu_fusion.report": ["*.css", "*.js"]},
+    package_data={"imu_fusion.report": ["*.css", "*.js"], "imu_fusion.nodes.flow": ["*.xml"]},
     zip_safe=False,
 )

@@ -20,6 +20,7 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.estimation.acceleration_field_calibration import calibrate_array
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import (
     bool_message, fix_message, imu_message, mag_message, pose_message, string_message,
@@ -205,6 +206,34 @@ def drive(source):
     yield "fix_velocity", TWIST.msgtype, velocity_rows(stamp, gnss)
 
 
+# 60 s hold the whole rest at the start and most of the turning, in a few MB.
+MIMU_DURATION = 60.0
+MIMU_EPOCH = BROAD_EPOCH
+
+
+def mimu4444(source):
+    """Topics of a board of eight IMUs, turned by hand.
+
+    The accelerometers are calibrated from the static poses that come with the data and turned
+    into the axes of chip 0 (those of the board); ``imu/data_raw`` is the mean of the eight
+    gyroscopes and of the eight accelerometers.
+    """
+    data = np.load(source / "mimu4444" / "exp1_dynamic.npz")
+    keep = data["t"] < MIMU_DURATION
+    stamp = MIMU_EPOCH + np.round(data["t"][keep] * 1e9).astype(np.int64)
+    acc = calibrate_array(data["static_means_mps2"], STANDARD_GRAVITY).apply(
+        data["acc_counts"][keep] * float(data["acc_lsb_mps2"]))
+    gyr = np.radians(data["gyr_counts"][keep] * float(data["gyr_lsb_dps"]))
+    gyr = np.einsum("kij,nkj->nki", data["frame_R"].astype(float), gyr - data["gyro_bias_radps"])
+    # The 24 bits of mantissa that the calibration has; they compress better.
+    acc, gyr = (v.astype(np.float32).astype(np.float64) for v in (acc, gyr.mean(axis=1)))
+    yield "imu/data_raw", IMU.msgtype, [
+        (t, imu_message(t, IMU_FRAME, g, a)) for t, g, a in zip(stamp, gyr, acc.mean(axis=1))]
+    for k in range(acc.shape[1]):
+        yield f"accelerometers/imu{k}", IMU.msgtype, [
+            (t, imu_message(t, IMU_FRAME, None, a)) for t, a in zip(stamp, acc[:, k])]
+
+
 def simulated_jump(source):
     """Topics of a simulated ski jump, with its truth; nothing of it was measured."""
     jump = SkiJump(load_surface("oberstdorf_hs106"))
@@ -262,6 +291,13 @@ RECORDINGS = {r.name: r for r in (
               "`data/drive_0708`", "BSD-3-Clause", "licenses/GNSS_IMU_BSD-3-Clause.txt",
               "Copyright (c) 2025, rtklibexplorer",
               ("drive_0708/imu.csv", "drive_0708/gnss.csv"), drive),
+    Recording("mimu4444", "board of eight IMUs, still, then turned by hand at up to 50 rad/s",
+              "[hcarlsso/Self-Calibration-Inertial-Sensor-Arrays-BCD.jl]"
+              "(https://github.com/hcarlsso/Self-Calibration-Inertial-Sensor-Arrays-BCD.jl), "
+              "experiment 1, first 60 s", "MIT", "licenses/mimu4444_MIT.txt",
+              "Copyright (c) 2021 Håkan Carlsson. Changed: units, calibration from the static poses, "
+              "axes of all chips turned into those of chip 0, gyroscopes averaged, format",
+              ("mimu4444/exp1_dynamic.npz",), mimu4444),
     Recording("jump_simulated", "SIMULATED ski jump on the profile of Oberstdorf HS106: a phone "
               "and a GNSS logger with the errors of Fang et al. (2020), tables 3 to 5; nothing "
               "of it was measured",

@@ -59,8 +59,8 @@ def clipped_gyroscope(run):
     clipped = (np.abs(gyr) >= LIMIT).any(axis=1)
     given = np.where(clipped, LIMIT * np.sign(truth), truth)
     judged = clipped & ~at_range
-    # The chips differ by their scale factors; their mean by this.
-    spread = np.sqrt(np.mean(np.var(gyr, axis=1)[~at_range.any(axis=1)]) / 8)
+    # The chips differ this much, by their scale factors; their mean is trusted no better.
+    spread = np.sqrt(np.mean(np.var(gyr, axis=1)[~at_range.any(axis=1)]))
     gyroscope = GyroscopeParams(noise_density=spread / np.sqrt(RATE) / BEGIN.noise_scale,
                                 range=LIMIT)
     fit = AccelerationFieldEstimator(BEGIN.replace(smoother__iterations=1),
@@ -73,8 +73,9 @@ def clipped_gyroscope(run):
     results["cubic spline through the rest"] = (spline - truth)[judged], np.nan
     for mode in ("causal", "smoothed"):
         estimator = AccelerationFieldEstimator(
-            fit.fitted.replace(mode=mode, maximum_likelihood="off"), sensors(positions, noise),
-            gyroscope)
+            fit.fitted.replace(mode=mode, maximum_likelihood="off",
+                               smoother__iterations=BEGIN.smoother__iterations),
+            sensors(positions, noise), gyroscope)
         rows = estimator.run(stamp, acc, given)
         begin = len(stamp) - len(rows)
         use = judged[begin:]

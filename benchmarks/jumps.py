@@ -29,7 +29,7 @@ class Scores:
         r, n = self.rms(), self.nees()
         length = np.sqrt(np.mean(self.rows[:, 13] ** 2))
         return [f"{r[0]:.3f}/{r[1]:.3f}/{r[2]:.3f}", f"{r[3]:.4f}/{r[4]:.4f}/{r[5]:.4f}",
-                f"{r[6]:.2f}/{r[7]:.2f}/{r[8]:.2f}", f"{n[0]:.1f}/{n[1]:.1f}/{n[2]:.1f}",
+                f"{r[6]:.2f}/{r[7]:.2f}/{r[8]:.2f}", f"{n[0]:.2f}/{n[1]:.2f}/{n[2]:.2f}",
                 "-" if np.isnan(length) else f"{length:.3f}",
                 f"{self.rows[:, 12].mean():.1f} (max {self.rows[:, 12].max():.0f})"]
 

@@ -7,17 +7,18 @@ recording and parameters the estimates are those of the nodes, bit for bit.
 import json
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
+from imu_fusion.messages import acceleration_field_stream as field_stream
 from imu_fusion.messages import orientation_stream as orientation
 from imu_fusion.messages import smoothing
 from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
 from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.streams import EstimatorNodeParams
-from imu_fusion.parameter_file import parameters_for
+from imu_fusion.parameter_file import node_values, parameters_for
 from imu_fusion.samples.guard import guard_log
 
 
@@ -25,20 +26,37 @@ from imu_fusion.samples.guard import guard_log
 class Stage:
     """One estimator of the batch path.
 
-    ``run(params, logs, report)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
-    report; ``logs`` maps a topic to (log, epochs) of the samples fit for use, without optional
-    topics that the recording lacks. ``findings(logs)`` lists in words what looks wrong with
-    whole logs as recorded. ``node_params`` are those of the node alone: read, not used.
+    ``run(logs, report, *params)`` yields (topic, stamp, cdr) of the ``outputs`` and fills in the
+    report; ``params`` are objects of the classes of that name; ``logs`` maps a topic to
+    (log, epochs) of the samples fit for use, without optional topics that the recording lacks.
+    ``findings(logs)`` lists in words what looks wrong with whole logs as recorded.
+    ``node_params`` are those of the node alone: read, not used.
+    ``kinds`` maps topics to the SampleType that reads them where it is not the usual one of
+    their message type; ``unusable`` says why the stage cannot run.
     """
 
     node: str
-    params: type
+    params: tuple
     node_params: tuple
     required: dict
     optional: dict
     outputs: dict
     run: Callable
     findings: Callable
+    kinds: dict = field(default_factory=dict)
+    configure: Callable | None = None
+    unusable: str = ""
+
+    def prepare(self, params_file):
+        """(Stage, parameters): with ``configure``, topics may depend on the parameters."""
+        if self.configure is not None:
+            return self.configure(self, params_file)
+        params = parameters_for(self.params + self.node_params, self.node, params_file)
+        return self, params[:len(self.params)]
+
+    def kind(self, topic, info):
+        """The SampleType that reads a topic (bag.TopicInfo) of this stage."""
+        return self.kinds.get(topic) or SAMPLE_TYPES[info.msgtype]
 
 
 @dataclass
@@ -50,7 +68,7 @@ class StageReport:
     """
 
     node: str
-    params: object
+    params: list
     used: dict = field(default_factory=dict)
     refused: dict = field(default_factory=dict)
     written: Counter = field(default_factory=Counter)
@@ -66,15 +84,41 @@ def _types(inputs, topics):
 def stages():
     """The estimators that ``process`` knows, by node name."""
     return {stage.node: stage for stage in (
-        Stage("orientation_estimator", OrientationParams, (EstimatorNodeParams,),
+        Stage("orientation_estimator",
+              (OrientationParams, orientation.OrientationOutputParams), (EstimatorNodeParams,),
               required=_types(orientation.INPUTS, [orientation.IMU_TOPIC]),
-              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC]),
+              optional=_types(orientation.INPUTS, [orientation.MAG_TOPIC, orientation.FIX_TOPIC]),
               outputs=orientation.OUTPUTS, run=orientation.run, findings=orientation.findings),
-        Stage("smoother", smoothing.SmoothingParams, (smoothing.SmootherNodeParams,),
+        Stage("smoother", (smoothing.SmoothingParams,), (smoothing.SmootherNodeParams,),
               required=_types(smoothing.INPUTS, smoothing.REQUIRED),
               optional=_types(smoothing.INPUTS, [smoothing.MAG_TOPIC, smoothing.VELOCITY_TOPIC]),
               outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings),
+        Stage(field_stream.NODE, (field_stream.FieldConfiguration,), (EstimatorNodeParams,),
+              required={}, optional={}, outputs=field_stream.OUTPUTS, run=field_stream.run,
+              findings=lambda logs: [], configure=_configure_field),
     )}
+
+
+def field_configuration(params_file):
+    """The FieldConfiguration of the acceleration field estimator in a parameter file (or None).
+
+    Raises:
+        ParameterError, LayoutError: with the name of what is wrong.
+    """
+    values = node_values(field_stream.NODE, params_file, field_stream.FieldConfiguration.names())
+    for info in EstimatorNodeParams.infos():
+        values.pop(info.name, None)
+    return field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
+
+
+def _configure_field(stage, params_file):
+    config = field_configuration(params_file)
+    gyroscope = [field_stream.GYROSCOPE_TOPIC] * (config.gyroscope is not None)
+    return replace(
+        stage, kinds=config.inputs, optional=_types(config.inputs, gyroscope),
+        required=_types(config.inputs, [t for t in config.inputs if t not in gyroscope]),
+        unusable="" if config.accelerometers else
+        "no accelerometers described; set accelerometers.names in a parameter file"), [config]
 
 
 def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
@@ -104,11 +148,14 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
     with open_bag(bag) as reader:
         chosen, reports = [], []
         for stage in known.values():
-            params, *_ = parameters_for([stage.params, *stage.node_params], stage.node, params_file)
+            stage, params = stage.prepare(params_file)
             report = StageReport(stage.node, params)
             reports.append(report)
             if stage.node in without:
                 report.skipped = "switched off"
+                continue
+            if stage.unusable:
+                report.skipped = stage.unusable
                 continue
             names, missing = inputs_of(stage, reader, remap)
             if missing:
@@ -118,22 +165,26 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         if not chosen:
             raise TopicError("nothing to do: " + "; ".join(
                 f"{r.node}: {r.skipped}" for r in reports))
-        wanted = sorted({name for _, _, names in chosen for name in names.values()})
+        kinds = {(name, stage.kind(topic, reader.topics[name]))
+                 for stage, _, names in chosen for topic, name in names.items()}
+        wanted = sorted({name for name, _ in kinds})
         progress(f"reading {', '.join(wanted)} from {Path(bag).name}")
-        logs = _read(reader, wanted)
+        logs = _read(reader, wanted, kinds)
         warnings = list(reader.warnings)
     with BagWriter(out, overwrite=overwrite) as writer:
         for stage, report, names in chosen:
-            progress(f"{stage.node}: {', '.join(f'{len(logs[n][0])} {n}' for n in names.values())}")
-            inputs = {}
+            inputs, recorded = {}, {}
             for topic, name in names.items():
-                _, log, epochs, guard = logs[name]
+                recorded[topic], log, epochs, guard = logs[
+                    name, stage.kind(topic, reader.topics[name])]
                 inputs[topic] = (log, epochs)
                 report.used[topic] = len(log)
                 if guard.refused():
                     report.refused[topic] = guard.refused()
-            warnings += stage.findings({topic: logs[name][0] for topic, name in names.items()})
-            for topic, stamp, cdr in stage.run(report.params, inputs, report):
+            progress(f"{stage.node}: "
+                     + ", ".join(f"{len(log)} {names[topic]}" for topic, log in recorded.items()))
+            warnings += stage.findings(recorded)
+            for topic, stamp, cdr in stage.run(inputs, report, *report.params):
                 writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
                 report.written[topic] += 1
             if report.summary:
@@ -166,14 +217,14 @@ def inputs_of(stage, reader, remap):
     return names, explain_missing(reader, missing)
 
 
-def _read(reader, names):
-    """dict of topic to (log as recorded, log fit for use, its epochs, Guard), in bag order."""
+def _read(reader, names, kinds):
+    """dict of (topic, SampleType) to (log as recorded, log fit for use, its epochs, Guard), in
+    bag order."""
     raw = {name: [] for name in names}
     for topic, _, _, cdr in reader.messages(names):
         raw[topic].append(cdr)
-    logs = {name: SAMPLE_TYPES[reader.topics[name].msgtype].read(messages)
-            for name, messages in raw.items()}
-    return {name: (log, *guard_log(log)) for name, log in logs.items()}
+    logs = {(name, kind): kind.read(raw[name]) for name, kind in kinds}
+    return {key: (log, *guard_log(log)) for key, log in logs.items()}
 
 
 def explain_missing(reader, wanted):

@@ -163,13 +163,24 @@ def _number(value, form):
 @click.argument("source", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
+@click.option("--csv", "description", type=click.Path(), metavar="YAML",
+              help="SOURCE is a table of accelerometers; YAML names its columns, units, positions "
+                   "and axes.")
 @remap_option
 @overwrite_option
-def convert(source, out, topics, remap, overwrite):
+def convert(source, out, topics, description, remap, overwrite):
     """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
 
-    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT.
+    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With --csv
+    SOURCE is a table, and OUT.yaml becomes the parameter file that process takes.
     """
+    if description is not None:
+        if topics or remap:
+            raise click.UsageError("--csv goes without --topic and --remap")
+        from imu_fusion.messages.csv_import import import_csv
+        parameter_file, count = import_csv(source, description, out, overwrite)
+        click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
+        return
     from imu_fusion.messages.bag import BagWriter, open_bag
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
@@ -233,7 +244,8 @@ def _ros_args(**values):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
-@click.option("--estimates", type=click.Path(), help="Recording with imu/data, if not in BAG.")
+@click.option("--estimates", type=click.Path(),
+              help="Recording with imu/data or acceleration_field/*, if not in BAG.")
 @click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
 def report(bag, estimates, params_file, out):

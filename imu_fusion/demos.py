@@ -7,6 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from imu_fusion import demos_trajectory as trajectory
+from imu_fusion.demos_impact import impact
 from imu_fusion.demos_trajectory import shared
 from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.orientation_error import (moving_at, orientation_errors, shares_within,
@@ -82,7 +83,8 @@ def _error_table(errors, moving):
     return table
 
 
-DEMOS = {"orientation": orientation, "drive": trajectory.drive, "jump": trajectory.jump}
+DEMOS = {"orientation": orientation, "impact": impact, "drive": trajectory.drive,
+         "jump": trajectory.jump}
 
 
 def run(name, out, console):

@@ -65,8 +65,8 @@ def parameters_for(classes, node, path=None, ignore=()):
     """
     if path is None:
         return [cls() for cls in classes]
-    values = _values(classes, node, path)
     known = {info.name for cls in classes for info in cls.infos()}
+    values = node_values(node, path, known)
     resolve_paths(values, classes, node, [path])
     result = []
     for cls in classes:
@@ -84,21 +84,26 @@ def resolve_paths(values, classes, node, paths):
         classes, node: as for :func:`parameters_for`.
         paths: the parameter files that the values may come from, the last one counts.
     """
-    settings = [(path, _values(classes, node, path)) for path in paths]
-    for info in (info for cls in classes for info in cls.infos() if info.path):
-        value = values.get(info.name)
+    names = {info.name for cls in classes for info in cls.infos() if info.path}
+    settings = [(path, node_values(node, path, names)) for path in paths]
+    for name in names:
+        value = values.get(name)
         for path, own in reversed(settings):
-            if value and own.get(info.name) == value:
+            if value and own.get(name) == value:
                 candidate = Path(path).absolute().parent / value
                 if candidate.exists():
-                    values[info.name] = str(candidate)
+                    values[name] = str(candidate)
                 break
 
 
-def _values(classes, node, path):
-    """Flat mapping of what a file sets for one node; ``/**`` only where it knows the name."""
+def node_values(node, path, known):
+    """Names and values, dotted, that a file gives to a node: of ``/**`` only the known ones.
+
+    An empty dict without a file (path None).
+    """
+    if path is None:
+        return {}
     nodes = load(path)
-    known = {info.name for cls in classes for info in cls.infos()}
     values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
     values.update(flatten(nodes.get(node, {})))
     values.pop("use_sim_time", None)

@@ -11,7 +11,6 @@ from imu_fusion.batch import inputs_of, stages
 from imu_fusion.errors import TopicError
 from imu_fusion.graph import Graph
 from imu_fusion.messages.bag import open_bag
-from imu_fusion.parameter_file import parameters_for
 
 SMOOTHER = "smoother"
 _PATIENCE = 3600.0  # s; the nodes notice by themselves when nothing can come any more
@@ -47,9 +46,11 @@ def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, log
     with open_bag(bag) as reader:
         for stage in known.values():
             # Here, for a bad file to be refused before anything starts.
-            parameters_for([stage.params, *stage.node_params], stage.node, params_file)
+            stage, _ = stage.prepare(params_file)
+            if stage.node in without or stage.unusable:
+                continue
             names, missing = inputs_of(stage, reader, remap or {})
-            if stage.node in without or (missing and stage.node != SMOOTHER):
+            if missing and stage.node != SMOOTHER:
                 continue
             if missing:
                 raise TopicError(f"nothing to smooth: {missing}")

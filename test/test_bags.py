@@ -55,6 +55,7 @@ def test_licences_are_those_of_the_sources():
     assert all("Attribution 4.0 International" in licence[name] for name in BROAD)
     assert "Paul Riseborough" in licence["px4_plane"]
     assert "rtklibexplorer" in licence["drive_0708"]
+    assert "Carlsson" in licence["mimu4444"]
 
 
 @pytest.mark.parametrize("name", MANIFEST)
@@ -111,7 +112,8 @@ def test_units_are_si(logs, name):
     assert norm[quiet].mean() == pytest.approx(9.81, rel=0.02)
     gyr = imu.gyr[quiet * window:(quiet + 1) * window]
     assert np.linalg.norm(gyr.mean(axis=0)) < np.radians(3)
-    assert np.abs(imu.gyr).max() < 40  # rad/s; in degrees it would exceed this
+    # rad/s; in degrees it would exceed this. The gyroscopes of mimu4444 clip at 34.9 rad/s.
+    assert np.abs(imu.gyr).max() < 40
     if "/imu/mag" in MANIFEST[name]["topics"]:
         field = np.linalg.norm(logs(name, "imu/mag").mag, axis=1)
         assert 20e-6 < np.median(field) < 70e-6
@@ -178,6 +180,14 @@ def test_gnss_velocity_is_the_rate_of_the_position(logs):
     sd = np.sqrt(np.diagonal(drive.cov_enu, axis1=1, axis2=2))
     assert 0.005 < np.median(sd) < 0.03  # RTK: 1-2 cm
     assert set(np.unique(drive.status)) == {0, 2}
+
+
+def test_accelerometers_of_an_array_agree_while_it_is_still(logs):
+    accelerometers = [logs("mimu4444", f"accelerometers/imu{k}") for k in range(8)]
+    still = np.array([log.acc[:500].mean(axis=0) for log in accelerometers])
+    # Calibrated to 1 % of gravity, and in the same axes.
+    assert np.linalg.norm(still, axis=1) == pytest.approx(9.81, rel=0.01)
+    assert np.abs(still - still.mean(axis=0)).max() < 0.1
 
 
 @pytest.mark.skipif(not SOURCE.exists(), reason="the sources are not here (IMU_FUSION_DATA)")

@@ -44,9 +44,15 @@ class OrientationParams(Parameters):
         doc="Magnetic declination, positive east; unset: 0, north is magnetic north.")
     yaw_offset_deg: float = param(0.0, unit="deg", low=-360, high=360,
                                   doc="Turns the orientation about the vertical.")
+    heading_anchor: str = param(
+        "rest", choices=("rest", "field"),
+        doc="rest: heading is what the magnetometer shows in the first interval; field: it "
+            "follows the magnetometer's calibration as that becomes known.")
+    heading_sd_deg: float = param(1.0, unit="deg", low=0, high=180,
+                                  doc="Uncertainty of the heading that the first interval shows.")
     alignment_duration: float = param(1.0, unit="s", low=0.05, high=60,
                                       doc="First interval, from which the orientation starts.")
-    gyr_noise_density: float = param(1e-4, unit="rad/s/sqrt(Hz)", low=1e-9, high=1,
+    gyr_noise_density: float = param(3e-4, unit="rad/s/sqrt(Hz)", low=1e-9, high=1,
                                      doc="Gyroscope noise.")
     gyr_bias_sd: float = param(0.01, unit="rad/s", low=0, high=1,
                                doc="Standard deviation of a bias that no rest has shown.")
@@ -60,6 +66,9 @@ class OrientationParams(Parameters):
                                      doc="Accelerometer noise.")
     acc_bias_sd: float = param(0.05, unit="m/s^2", low=0, high=10,
                                doc="Standard deviation of the accelerometer bias.")
+    axes_sd: float = param(0.005, unit="rad", low=0, high=1,
+                           doc="Uncertainty of the sensor's axes in its case, part of the "
+                               "attitude's covariance.")
     mag_noise_sd: float = param(1e-6, unit="T", low=1e-12, high=1e-4,
                                 doc="Noise of one magnetometer sample.")
     mag_offset: tuple[float, ...] = param((0.0, 0.0, 0.0), unit="T", length=3,
@@ -81,10 +90,12 @@ class OrientationParams(Parameters):
     mag_delay_sd: float = param(0.01, unit="s", low=0, high=0.1,
                                 doc="Standard deviation of a magnetometer delay that is not given.")
     block: float = param(0.02, unit="s", low=1e-3, high=1, doc="Time between corrections.")
-    gyr_scale_sd: float = param(0.003, low=0, high=0.2,
+    gyr_scale_sd: float = param(0.005, low=0, high=0.2,
                                 doc="Standard deviation of gyroscope scale and misalignment.")
     estimate_bias: bool = param(True, doc="Whether gyroscope bias and scale are estimated.",
                                 read_only=False)
+    use_acc: bool = param(
+        True, doc="fusion: whether the accelerometer is used after the start.")
     velocity_walk: float = param(0.1, unit="m/s^2/sqrt(Hz)", low=0,
                                  doc="What the specific force does not tell of the motion.")
     velocity_sd: float = param(0.6, unit="m/s", low=1e-3,
@@ -156,6 +167,17 @@ class OrientationEstimator:
         self._mag = np.empty(3)
         self._new_chunk()
         self.reset()
+
+    def set_params(self, params):
+        """Go on with other parameters from the next sample on.
+
+        Raises:
+            ParameterError: another method or mode, which have another state.
+        """
+        if (params.method, params.mode) != (self.params.method, self.params.mode):
+            raise ParameterError("parameters 'method' and 'mode' cannot change while running: "
+                                 "start another estimator")
+        self.params, self._par = params, self._pack(params)
 
     def reset(self):
         """Forget all samples: the next ones start a new alignment."""
@@ -369,6 +391,7 @@ class OrientationEstimator:
         par[st.P_RELIABILITY] = p.mag_reliability
         par[st.P_GAP_RATE_SD] = p.gap_rate_sd
         par[st.P_BIAS_WALK] = p.gyr_bias_walk
+        par[st.P_AXES_SD] = p.axes_sd
         par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.nan)
         par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
         par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset

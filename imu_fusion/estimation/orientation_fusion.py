@@ -24,52 +24,29 @@ from numba import njit
 
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_state as st
+from imu_fusion.estimation.orientation_fusion_detect import (
+    REST_MEMORY, find_limits, is_still, mean_rate)
+from imu_fusion.estimation.orientation_fusion_field import (
+    collect_mags, start_field, update_mag)
+from imu_fusion.estimation.orientation_fusion_layout import (
+    ACC_LAST, BLOCK_MAGS, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT, MAG_ROWS, MAG_SUM,
+    MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK, P_ESTIMATE_BIAS, P_EXCESS_WALK,
+    P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD,
+    P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD, P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME,
+    REST_SINCE, S, SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
 from imu_fusion.estimation.orientation_state import push_mag
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse, quat_to_matrix)
+    quat_exp, quat_multiply, quat_normalize, quat_to_matrix)
 
-N = es.N
-# Float state.
-S = st.X_COMMON            # (N,) nominal values of the slow states, velocity, position; attitude unused
-COV = S + N                # (N, N)
-NORM = COV + N * N         # field norm, tesla; 0 before the first sample
-GRAVITY = NORM + 1         # m/s^2
-HEADING_VAR = NORM + 2     # rad^2, of the heading against true north; not observable later
-ACC_LAST = NORM + 3        # (3,)
-MEAN_RATE = NORM + 6       # (3,) low-passed raw rate, for the rest detector
-MEAN_FORCE = NORM + 9      # (3,)
-MOVE = NORM + 12           # the block being collected
-MAG_SUM = MOVE + es.MOVE_SIZE   # (3,) of z in world axes; then lag (3,), offset (9,), matrix (27,)
-MAG_ROWS = 42
-LIMIT = MAG_SUM + MAG_ROWS  # (3,) gyroscope limits found
-REPEATED = LIMIT + 3       # (3,) last value of each axis
-ENTRY = REPEATED + 3       # (3,) step with which it was reached
-LARGEST = ENTRY + 3        # (3,) largest rate seen
-X_SIZE = LARGEST + 3
+# What every kernel offers beside its functions.
+__all__ = ["K_SIZE", "P_SIZE", "X_SIZE", "advance", "initialise", "pack", "push_mag", "run_loop",
+           "step_imu"]
 
-# Integer state.
-BLOCK_MAGS = st.K_COMMON
-REST_SINCE = BLOCK_MAGS + 1
-CLIPPED = BLOCK_MAGS + 2   # bit per axis at its limit
-WAS_CLIPPED = BLOCK_MAGS + 3  # the same in the block before
-REPEATS = BLOCK_MAGS + 4   # (3,) how often each axis repeated its largest value
-WORLD_TURNED = REPEATS + 3  # the heading was fixed in this block
-K_SIZE = WORLD_TURNED + 1
-
-# Parameters.
-(P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,
- P_FIELD_WALK, P_MAG_RELATIVE, P_NORM_FACTOR, P_REST_RATE, P_REST_FORCE, P_REST_TIME,
- P_REST_RATE_SD, P_EXCESS_WALK, P_ESTIMATE_BIAS, P_SCALE_SD, P_OFFSET_SD, P_SOFT_SD,
- P_LAG_SD) = range(st.P_COMMON, st.P_COMMON + 21)
-P_SIZE = st.P_COMMON + 21
-
-_REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
+_SWAY_TIME = 3.0           # s: velocity changes faster than this show in SWAY
+_MOTION_TIME = 10.0        # s: over which the size of the motion is judged
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
 _BURST_SHARE = 0.5         # of the block, while an axis is at its limit
-_REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
-_ENTRY_SHARE = 2e-3        # a flat top is run into; a quantised smooth peak is not
-_LIMIT_FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
 
 
 def pack(par, p):
@@ -79,7 +56,8 @@ def pack(par, p):
         p.position_time, p.local_field_sd, p.local_field_time, p.field_walk, p.mag_sd,
         p.norm_deviation_factor, p.rest_rate, p.rest_force, p.rest_time, p.rest_rate_sd,
         p.saturation_walk, p.estimate_bias, p.gyr_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
-        p.mag_delay_sd if p.mag_delay is None else 0.0)
+        p.mag_delay_sd if p.mag_delay is None else 0.0, p.heading_anchor == "field",
+        math.radians(p.heading_sd_deg), p.use_acc)
 
 
 def initialise(x, k, par, a):
@@ -89,7 +67,7 @@ def initialise(x, k, par, a):
     x[S + es.BIAS:S + es.BIAS + 3] = x[st.GYR_BIAS:st.GYR_BIAS + 3] = a.gyr_bias
     x[S + es.LAG] = x[st.LAG]
     x[GRAVITY] = a.gravity
-    x[HEADING_VAR] = a.cov_attitude_world[2, 2]
+    x[HEADING_VAR] = st.UNIFORM_VARIANCE
     x[MEAN_RATE:MEAN_RATE + 3] = a.gyr_bias
     x[LIMIT:LIMIT + 3] = np.where(np.isnan(par[st.P_RANGE:st.P_RANGE + 3]), np.inf,
                                   par[st.P_RANGE:st.P_RANGE + 3])
@@ -104,104 +82,9 @@ def initialise(x, k, par, a):
     sd[es.LAG] = par[P_LAG_SD]
     sd[es.SOFT:es.EXCESS] = par[P_SOFT_SD]
     x[COV:COV + N * N] = np.diag(sd ** 2).ravel()
-    k[st.HEADING_KNOWN] = a.has_heading
     if a.field_world is not None:
-        _start_field(x, par, a.field_world)
-
-
-@njit(cache=True)
-def _start_field(x, par, field):
-    """Begin the field states with ``field`` (3,) tesla, measured here and now, world axes.
-
-    field = z - local - [z]x dtheta: the first field shares the tilt's error. Heading has
-    none by definition: it is what the field says; its error against true north is
-    kept apart.
-    """
-    cov = x[COV:COV + N * N].reshape(N, N)
-    x[NORM] = math.sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
-    b = field / x[NORM]
-    x[S + es.FIELD:S + es.FIELD + 3] = b
-    local = par[P_LOCAL_SD] ** 2
-    for i in range(3):
-        for j in range(N):
-            cov[es.FIELD + i, j] = 0.0
-            cov[j, es.FIELD + i] = 0.0
-            cov[es.LOCAL + i, j] = 0.0
-            cov[j, es.LOCAL + i] = 0.0
-    for i in range(3):
-        j, m = (i + 1) % 3, (i + 2) % 3
-        for c in range(N):
-            # row i of -[b]x: dtheta_m b_j with a minus, dtheta_j b_m
-            cov[es.FIELD + i, c] = -b[j] * cov[es.ATT + m, c] + b[m] * cov[es.ATT + j, c]
-    for i in range(3):
-        for c in range(N):
-            if c < es.FIELD or c >= es.LOCAL:
-                cov[c, es.FIELD + i] = cov[es.FIELD + i, c]
-    for i in range(3):
-        # [b]x P [b]x' from the attitude columns just written
-        row = cov[es.FIELD + i, es.ATT:es.ATT + 3].copy()
-        for c in range(3):
-            j, m = (c + 1) % 3, (c + 2) % 3
-            cov[es.FIELD + i, es.FIELD + c] = -b[j] * row[m] + b[m] * row[j]
-    for i in range(3):
-        cov[es.LOCAL + i, es.LOCAL + i] = local
-        cov[es.FIELD + i, es.LOCAL + i] = -local
-        cov[es.LOCAL + i, es.FIELD + i] = -local
-        cov[es.FIELD + i, es.FIELD + i] += local + 1e-5
-
-
-@njit(cache=True)
-def _fix_heading(x, k, par, z):
-    """Turn the world about up so that ``z`` (3,) tesla, world axes, points magnetic north."""
-    k[WORLD_TURNED] = 1
-    horizontal = math.hypot(z[0], z[1])
-    norm = math.sqrt(horizontal ** 2 + z[2] ** 2)
-    if horizontal < 0.02 * norm:
-        _start_field(x, par, z)
-        return
-    # The needle points to azimuth D: east sin D, north cos D.
-    angle = 0.5 * math.pi - par[st.P_DECLINATION] - math.atan2(z[1], z[0])
-    turn = quat_exp(np.array([0.0, 0.0, angle]))
-    x[st.Q:st.Q + 4] = quat_multiply(turn, x[st.Q:st.Q + 4])
-    cov = x[COV:COV + N * N].reshape(N, N)
-    for group in (es.ATT, es.VEL, es.POS):
-        x[S + group:S + group + 3] = quat_rotate(turn, x[S + group:S + group + 3])
-        for j in range(N):
-            cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j].copy())
-        for j in range(N):
-            cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3].copy())
-    x[HEADING_VAR] = ((par[P_MAG_RELATIVE] ** 2 + par[P_LOCAL_SD] ** 2)
-                      * (norm / horizontal) ** 2)
-    k[st.HEADING_KNOWN] = 1
-    _start_field(x, par, quat_rotate(turn, z))
-
-
-@njit(cache=True)
-def _find_limits(x, k, par, gyr):
-    """Learn each axis' limit from flat tops, unless given; mark the axes at theirs."""
-    clipped = 0
-    # A driver that repeats whole samples makes no flat tops.
-    held = (gyr[0] == x[REPEATED] and gyr[1] == x[REPEATED + 1] and gyr[2] == x[REPEATED + 2])
-    for i in range(3):
-        size = abs(gyr[i])
-        if math.isnan(par[st.P_RANGE + i]):
-            if held:
-                pass
-            elif gyr[i] == x[REPEATED + i]:
-                k[REPEATS + i] += 1
-                if (k[REPEATS + i] >= _REPEATS_AT_LIMIT - 1 and size >= x[LARGEST + i]
-                        and x[ENTRY + i] > _ENTRY_SHARE * size > _ENTRY_SHARE * _LIMIT_FLOOR):
-                    x[LIMIT + i] = min(x[LIMIT + i], size)
-            else:
-                k[REPEATS + i] = 0
-                x[ENTRY + i] = abs(gyr[i] - x[REPEATED + i])
-            x[LARGEST + i] = max(x[LARGEST + i], size)
-            if size > x[LIMIT + i]:
-                x[LIMIT + i] = np.inf    # a repeated value that was no limit
-            x[REPEATED + i] = gyr[i]
-        if size >= x[LIMIT + i] * (1.0 - 1e-6):
-            clipped |= 1 << i
-    return clipped
+        follow = 1.0 if par[P_FOLLOW_FIELD] or not a.at_rest else 0.0
+        start_field(x, k, par, a.field_world, a.has_heading, follow)
 
 
 @njit(cache=True)
@@ -213,74 +96,6 @@ def _rate(x, gyr):
         for j in range(3):
             rate[i] += x[S + es.SCALE + 3 * i + j] * gyr[j]
     return rate
-
-
-@njit(cache=True)
-def _collect_mags(x, k, par, samples, count):
-    """Add magnetometer samples to the block; returns the reliability (10) of their mean.
-
-    samples: rows of take_mags. The mean in present imu axes goes to samples[0, :3], tesla.
-    """
-    lag_row, offset_row, soft_row = MAG_SUM + 3, MAG_SUM + 6, MAG_SUM + 15
-    mean = np.zeros(3)
-    quat = x[st.Q:st.Q + 4]
-    if x[NORM] == 0.0 and count > 0:
-        _fix_heading(x, k, par, quat_rotate(quat_multiply(quat, samples[0, 6:10]),
-                                            samples[0, :3]))
-        quat = x[st.Q:st.Q + 4]
-    norm = x[NORM]
-    for s in range(count):
-        raw = samples[s, :3] / norm
-        m = raw.copy()
-        for i in range(3):
-            m[i] -= x[S + es.OFFSET + i]
-            for j in range(3):
-                m[i] -= x[S + es.SOFT + 3 * i + j] * raw[j]
-        rate = samples[s, 3:6]
-        r = quat_to_matrix(quat_multiply(quat, samples[s, 6:10]))
-        drag = np.array([rate[1] * m[2] - rate[2] * m[1], rate[2] * m[0] - rate[0] * m[2],
-                         rate[0] * m[1] - rate[1] * m[0]])
-        for i in range(3):
-            for j in range(3):
-                x[MAG_SUM + i] += r[i, j] * m[j]
-                x[lag_row + i] += r[i, j] * drag[j]
-                x[offset_row + 3 * i + j] += r[i, j]
-                for c in range(3):
-                    x[soft_row + 9 * i + 3 * j + c] += r[i, j] * raw[c]
-        mean += quat_rotate(samples[s, 6:10], m) / count
-        k[BLOCK_MAGS] += 1
-    samples[0, :3] = mean * norm
-    size = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
-    return math.exp(-(par[st.P_RELIABILITY] * (1.0 - size)) ** 2)
-
-
-@njit(cache=True)
-def _update_mag(x, k, par, error, still, tape):
-    """The block's mean magnetometer sample against the field."""
-    cov = x[COV:COV + N * N].reshape(N, N)
-    count = k[BLOCK_MAGS]
-    z = x[MAG_SUM:MAG_SUM + 3] / count
-    lag_row, offset_row, soft_row = MAG_SUM + 3, MAG_SUM + 6, MAG_SUM + 15
-    expected = x[S + es.FIELD:S + es.FIELD + 3] + x[S + es.LOCAL:S + es.LOCAL + 3]
-    deviation = abs(math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2) - 1.0)
-    time = x[MOVE + es.MOVE_TIME]
-    sd = par[P_MAG_RELATIVE] + par[P_NORM_FACTOR] * deviation
-    # White over 20 ms: faster sampling of the same disturbance is no news.
-    variance = sd * sd * max(0.02 / time, 1.0 / count) + (par[st.P_MAG_SD] / x[NORM]) ** 2 / count
-    index = np.empty(es.OP_WIDTH, dtype=np.int64)
-    row = np.empty(es.OP_WIDTH)
-    for i in range(3):
-        j, m = (i + 1) % 3, (i + 2) % 3
-        index[0], row[0] = es.ATT + m, expected[j]
-        index[1], row[1] = es.ATT + j, -expected[m]
-        index[2], row[2] = es.FIELD + i, 1.0
-        index[3], row[3] = es.LOCAL + i, 1.0
-        index[4], row[4] = es.LAG, x[lag_row + i] / count
-        for c in range(3):
-            index[5 + c], row[5 + c] = es.OFFSET + c, x[offset_row + 3 * i + c] / count
-        for c in range(9):
-            index[8 + c], row[8 + c] = es.SOFT + c, x[soft_row + 9 * i + c] / count
-        es.update(cov, error, 17, index, row, z[i] - expected[i], variance, tape)
 
 
 @njit(cache=True)
@@ -313,6 +128,16 @@ def _end_block(x, k, par, still, back, tape):
         tape[es.TAPE_MOVE:es.TAPE_MOVE + es.MOVE_SIZE] = move
     es.predict(cov, move)
 
+    # A body that moves more than was said is believed: a vehicle is not held by a hand.
+    motion = 0.0
+    for i in range(3):
+        change = move[es.MOVE_FORCE + i] - (x[GRAVITY] * time if i == 2 else 0.0)
+        x[SWAY + i] = math.exp(-time / _SWAY_TIME) * x[SWAY + i] + par[P_USE_ACC] * change
+        motion += x[SWAY + i] ** 2 / 3.0
+    x[MOTION] += min(time / _MOTION_TIME, 1.0) * (motion - x[MOTION])
+    # At equal accelerations times grow as velocities do, and extents as their square.
+    scale = math.sqrt(max(x[MOTION] / par[P_VEL_SD] ** 2, 1.0))
+
     error = np.zeros(N)
     index = np.empty(es.OP_WIDTH, dtype=np.int64)
     row = np.ones(es.OP_WIDTH)
@@ -323,17 +148,17 @@ def _end_block(x, k, par, still, back, tape):
     for i in range(3):
         index[0] = es.VEL + i
         variance = (_REST_SPEED_SD ** 2 * 0.02 / time if still
-                    else par[P_VEL_SD] ** 2 * max(par[P_VEL_TIME] / time, 1.0))
+                    else scale ** 3 * par[P_VEL_SD] ** 2 * max(par[P_VEL_TIME] / time, 1.0))
         es.update(cov, error, 1, index, row, -x[S + es.VEL + i], variance, tape)
         if still:
             index[0] = es.BIAS + i
-            es.update(cov, error, 1, index, row, _mean_rate(x, i) - x[S + es.BIAS + i],
-                      par[P_REST_RATE_SD] ** 2 * _REST_MEMORY / time, tape)
+            es.update(cov, error, 1, index, row, mean_rate(x, i) - x[S + es.BIAS + i],
+                      par[P_REST_RATE_SD] ** 2 * REST_MEMORY / time, tape)
         index[0] = es.POS + i
         es.update(cov, error, 1, index, row, -x[S + es.POS + i],
-                  par[P_POS_SD] ** 2 * max(par[P_POS_TIME] / time, 1.0), tape)
+                  scale ** 5 * par[P_POS_SD] ** 2 * max(par[P_POS_TIME] / time, 1.0), tape)
     if k[BLOCK_MAGS] > 0:
-        _update_mag(x, k, par, error, still, tape)
+        update_mag(x, k, par, error, still, tape)
 
     x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(quat_exp(error[:3].copy()),
                                                     x[st.Q:st.Q + 4]))
@@ -353,40 +178,6 @@ def _end_block(x, k, par, still, back, tape):
     x[MAG_SUM:MAG_SUM + MAG_ROWS] = 0.0
     k[BLOCK_MAGS] = 0
     k[WAS_CLIPPED] = k[CLIPPED] & ~back
-
-
-@njit(cache=True)
-def _mean_rate(x, i):
-    """Low-passed rate of axis i, scaled, with its bias."""
-    rate = x[MEAN_RATE + i]
-    for j in range(3):
-        rate += x[S + es.SCALE + 3 * i + j] * x[MEAN_RATE + j]
-    return rate
-
-
-@njit(cache=True)
-def _is_still(x, k, par, stamp, dt, gyr, acc):
-    """Rest: rate and force have kept to their short-term means, and the mean rate is bias.
-
-    Slow turning is told from rest by the bias' own uncertainty.
-    """
-    part = min(dt / _REST_MEMORY, 1.0)
-    rate2 = 0.0
-    force2 = 0.0
-    mean2 = 0.0
-    limit2 = 0.0
-    for i in range(3):
-        x[MEAN_RATE + i] += part * (gyr[i] - x[MEAN_RATE + i])
-        x[MEAN_FORCE + i] += part * (acc[i] - x[MEAN_FORCE + i])
-        rate2 += (gyr[i] - x[MEAN_RATE + i]) ** 2
-        force2 += (acc[i] - x[MEAN_FORCE + i]) ** 2
-        mean2 += (x[MEAN_RATE + i] - x[S + es.BIAS + i]) ** 2
-        slot = COV + (es.BIAS + i) * (N + 1)
-        limit2 += x[slot] + par[P_REST_RATE_SD] ** 2
-    if (rate2 > par[P_REST_RATE] ** 2 or force2 > par[P_REST_FORCE] ** 2
-            or mean2 > 9.0 * limit2):
-        k[REST_SINCE] = stamp
-    return stamp - k[REST_SINCE] > par[P_REST_TIME] * 1e9
 
 
 @njit(cache=True)
@@ -414,7 +205,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     flags = 0
     move = x[MOVE:MOVE + es.MOVE_SIZE]
 
-    clipped = _find_limits(x, k, par, gyr)
+    clipped = find_limits(x, k, par, gyr)
     if clipped:
         flags |= st.FLAG_SATURATED
         k[st.SATURATED] += 1
@@ -423,7 +214,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()
     raw = 0.5 * (last + gyr)
-    phi = _rate(x, raw) * dt
+    phi = st.rotation_of_step(_rate(x, last), _rate(x, gyr), dt)
     middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(0.5 * phi)))
     x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], quat_exp(phi)))
     k[st.LAST_STAMP] = stamp
@@ -438,8 +229,10 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
                 move[es.MOVE_EXCESS + 3 * i + j] += middle[i, j] * dt
             for c in range(3):
                 move[es.MOVE_SCALE + 9 * i + 3 * j + c] += middle[i, j] * raw[c] * dt
-        move[es.MOVE_FORCE + i] += force * dt
-        change = (force - (x[GRAVITY] if i == 2 else 0.0)) * dt
+        change = 0.0
+        if par[P_USE_ACC]:
+            move[es.MOVE_FORCE + i] += force * dt
+            change = (force - (x[GRAVITY] if i == 2 else 0.0)) * dt
         x[S + es.POS + i] += (x[S + es.VEL + i] + 0.5 * change) * dt
         x[S + es.VEL + i] += change
     move[es.MOVE_TIME] += dt
@@ -463,7 +256,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     reliability = np.nan
     mag = np.full(3, np.nan)
     if taken > 0:
-        reliability = _collect_mags(x, k, par, samples, taken)
+        reliability = collect_mags(x, k, par, samples, taken)
         mag = samples[0, :3].copy()
         if reliability < 0.5:
             flags |= st.FLAG_MAG_DISTURBED
@@ -472,7 +265,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
             flags |= st.FLAG_MAG_USED
             k[st.MAG_USED] += taken
 
-    still = _is_still(x, k, par, stamp, dt, gyr, acc)
+    still = is_still(x, k, par, stamp, dt, gyr, acc)
     if still:
         flags |= st.FLAG_STILL
     back = 0 if clipped == k[CLIPPED] or first else k[CLIPPED] & ~clipped

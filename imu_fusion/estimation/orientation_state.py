@@ -84,7 +84,8 @@ P_RANGE = 11       # (3,) gyroscope limit, inf if none, nan if it is to be found
 P_FRAME = 14       # (4,) rotation from ENU to the published world frame
 P_IRON_OFFSET = 18  # (3,) tesla
 P_IRON_MATRIX = 21  # (9,) row by row
-P_COMMON = 30
+P_AXES_SD = 30
+P_COMMON = 31
 TAKEN_WORDS = 10   # per magnetometer sample taken: field (3), rate (3), rotation (4)
 
 
@@ -92,6 +93,21 @@ TAKEN_WORDS = 10   # per magnetometer sample taken: field (3), rate (3), rotatio
 def is_finite3(v):
     """Whether the three elements of v are finite numbers."""
     return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
+
+
+@njit(cache=True)
+def rotation_of_step(rate, rate_next, dt):
+    """Rotation vector (3,) of a step over which the rate changes linearly.
+
+    The second term is that of coning: without it the error is of second order in dt
+    where the axis of rotation moves.
+    """
+    phi = np.empty(3)
+    for i in range(3):
+        j, m = (i + 1) % 3, (i + 2) % 3
+        phi[i] = (0.5 * dt * (rate[i] + rate_next[i])
+                  + dt * dt / 12.0 * (rate[j] * rate_next[m] - rate[m] * rate_next[j]))
+    return phi
 
 
 @njit(cache=True)
@@ -223,7 +239,7 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
             for m in range(3):
                 for n in range(3):
                     total += r[m, i] * cov_world[m, n] * r[n, j]
-            row[ROW_COV + 3 * i + j] = total
+            row[ROW_COV + 3 * i + j] = total + (par[P_AXES_SD] ** 2 if i == j else 0.0)
             row[ROW_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
             row[ROW_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
     for i in range(3):

@@ -20,8 +20,8 @@ class EstimatorNodeParams(Parameters):
     """What concerns a node, not its estimate."""
 
     qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
-                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
-                         "for repeats of what was lost (replay).")
+                     doc="Live subscriptions: sensor_data takes any publisher; reliable asks for "
+                         "repeats of what was lost. In a replay they are always reliable.")
 
 
 _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
@@ -35,9 +35,11 @@ class Stream:
         emit: called as ``emit(topic, stamp, cdr)`` with every message made.
         warn: called with a text when something is wrong with the input.
 
-    Subclasses implement ``restart`` (forget everything), ``take`` (one sample),
+    Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement ``restart`` (forget everything), ``take`` (one sample),
     ``flush`` (emit what is held back) and ``look_at`` (texts about first samples).
     """
+
+    same_frame = ()
 
     def __init__(self, inputs, emit, warn=lambda text: None):
         self.inputs = inputs
@@ -128,6 +130,7 @@ class Stream:
                       f"({count} so far)")
 
     def _compare_frames(self):
-        if len(set(self.frame_ids.values())) > 1:
-            named = ", ".join(f"{topic} in '{frame}'" for topic, frame in self.frame_ids.items())
+        frames = {t: f for t, f in self.frame_ids.items() if t in self.same_frame}
+        if len(set(frames.values())) > 1:
+            named = ", ".join(f"{topic} in '{frame}'" for topic, frame in frames.items())
             self.warn(f"sensors name different frames ({named}): their axes are taken as parallel")

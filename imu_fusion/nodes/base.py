@@ -1,8 +1,10 @@
 """What all nodes share: parameters from dataclasses, diagnostics, start and orderly end."""
 
 import importlib
+import os
 import signal
 import sys
+from pathlib import Path
 
 import rclpy
 import rclpy.node
@@ -63,8 +65,9 @@ def descriptor(info):
 class Node(rclpy.node.Node):
     """Base of our nodes.
 
-    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses.
-    Unknown parameters, wrong types and values out of bounds raise ParameterError.
+    Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses, and
+    ``OPEN_PREFIXES``: parameters below these need not be known, ``open_parameters`` holds them.
+    Other unknown parameters, wrong types and values out of bounds raise ParameterError.
 
     Args:
         params_files: the parameter files that rclpy was given: relative file names in them
@@ -73,6 +76,7 @@ class Node(rclpy.node.Node):
 
     NAME = ""
     PARAMETERS = ()
+    OPEN_PREFIXES = ()
 
     def __init__(self, params_files=(), **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
@@ -121,6 +125,10 @@ class Node(rclpy.node.Node):
                 given[name] = value.tolist() if hasattr(value, "tolist") else value
                 self.undeclare_parameter(name)
         known = {info.name: info for cls in self.PARAMETERS for info in cls.infos()}
+        self.open_parameters = {name: given.pop(name) for name in list(given)
+                                if name not in known and name.startswith(self.OPEN_PREFIXES)}
+        for name, value in self.open_parameters.items():
+            self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
@@ -156,8 +164,15 @@ class Node(rclpy.node.Node):
                             **{parameter.name.replace(".", "__"): parameter.value})
                     except ParameterError as error:
                         return SetParametersResult(successful=False, reason=str(error))
+        try:
+            self.apply(changed)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         self._params = changed
         return SetParametersResult(successful=True)
+
+    def apply(self, params):
+        """Parameters are about to change to ``params`` (class to object); may refuse."""
 
 
 def run_node(node_class, args=None):
@@ -183,6 +198,7 @@ def run_node(node_class, args=None):
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
+        use_fast_heartbeats()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
         _run(node_class, signals, files)
@@ -197,6 +213,13 @@ def run_node(node_class, args=None):
         rclpy.try_shutdown()
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def use_fast_heartbeats():
+    """Let Fast DDS notice lost messages soon, unless the user has profiles of their own."""
+    if not {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"} & os.environ.keys():
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(
+            Path(__file__).parent / "flow" / "fastdds.xml")
 
 
 def _run(node_class, signals, params_files):

@@ -16,6 +16,8 @@ from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.parameter_file import parameters_for
+from imu_fusion.report.acceleration_field import field_sections
+from imu_fusion.report.field_data import read_field
 from imu_fusion.report.figures import intervals
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import Notes, Numbers, Section, Text, write_report
@@ -91,10 +93,9 @@ def estimate_orientation(contents, params_file=None):
     has no imu/data_raw."""
     if RAW not in contents.logs:
         return None
-    stage = stages()["orientation_estimator"]
-    params, *_ = parameters_for([stage.params, *stage.node_params], stage.node, params_file)
-    messages = stage.run(params, contents.samples(stage.required | stage.optional),
-                         StageReport(stage.node, params))
+    stage, params = stages()["orientation_estimator"].prepare(params_file)
+    messages = stage.run(contents.samples(stage.required | stage.optional),
+                         StageReport(stage.node, params), *params)
     return attitude_log([cdr for topic, _, cdr in messages if topic == ESTIMATES])
 
 
@@ -124,7 +125,8 @@ def write_recording_report(bag, estimates, path, params_file=None):
         bag: recording with sensor topics and perhaps ``reference/pose``; another PoseStamped
             topic is used in its place if there is no such topic.
         estimates: recording with ``imu/data``, may be the same; if it has none, the report says
-            so. None: those in ``bag``, or else made from it.
+            so. None: those in ``bag``, or else made from it. ``acceleration_field/*`` in it
+            get their sections, too.
         path: HTML file to write.
         params_file: ROS 2 parameter file of the estimators, or None for defaults.
 
@@ -136,7 +138,8 @@ def write_recording_report(bag, estimates, path, params_file=None):
         ImuFusionError: parameters are not usable, or the file cannot be written.
     """
     contents = read_contents(bag)
-    estimate, warnings = read_estimates(bag if estimates is None else estimates)
+    source = bag if estimates is None else estimates
+    estimate, warnings = read_estimates(source)
     if estimate is None and estimates is None:
         estimate, estimates = estimate_orientation(contents, params_file), "this report's own run"
     smoothed, reason = smooth_recording(contents, params_file)
@@ -169,7 +172,8 @@ def write_recording_report(bag, estimates, path, params_file=None):
     blocks = [numbers]
     if warnings:
         blocks.append(Notes(tuple(warnings)))
-    if estimate is None:
+    field = read_field(bag, source, params_file)
+    if estimate is None and field is None:
         blocks.append(Text(f"{Path(estimates).name} holds no estimates on {ESTIMATES}: this "
                            "report is about the recording alone. imu_fusion process makes them."))
     elif errors is not None:
@@ -190,6 +194,8 @@ def write_recording_report(bag, estimates, path, params_file=None):
     if errors is not None:
         sections.append(error_section(errors, origin, moving, contents.reference_name, is_truth,
                                       shaded))
+    if field is not None:
+        sections += field_sections(field, origin)
     if estimate is not None and mag is not None:
         sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
     if raw is not None or estimate is not None:

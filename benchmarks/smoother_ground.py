@@ -1,0 +1,62 @@
+"""A ground robot whose GNSS height wanders: python -m benchmarks.smoother_ground
+
+No truth: the site is flat, so the spread of the smoothed height is set beside that of the
+fixes. The Imu runs at 30 Hz and the bag has no magnetometer and no GNSS velocity.
+"""
+
+import numpy as np
+
+from benchmarks.data import data_path
+from benchmarks.jumps import write
+from imu_fusion.errors import ImuFusionError
+from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.messages.bag import open_bag
+from imu_fusion.messages.convert import read_log
+from imu_fusion.surface_file import surface_from_mapping
+
+BASE = SmootherParams(gyr_noise_density=5e-3, acc_noise_density=0.1, acc_bias_sd=0.5,
+                      gyr_bias_sd=0.05, speed_sd=2.0)
+# Fixes wander by metres over minutes and scatter by some 0.3 m from one to the next.
+WANDER = BASE.replace(fix_sd=(0.5, 0.5, 1.0), gnss_position_error_sd=(3.0, 3.0, 15.0),
+                      gnss_position_error_tau=100.0)
+
+
+def main():
+    path = data_path("husky") / "test1.bag"
+    if not path.exists():
+        print("husky is not at hand: set IMU_FUSION_DATA")
+        return
+    with open_bag(path) as reader:
+        imu, fix = read_log(reader, "/imu/data"), read_log(reader, "/fix")
+    # The covariance that this receiver reports is of type unknown; the parameters rule.
+    fix.cov_enu[:] = 0.0
+    valid = np.flatnonzero(fix.status >= 0)
+    first = valid[0]
+    plane = surface_from_mapping({
+        "type": "plane", "slope_deg": 0.0, "aspect_deg": 0.0, "sigma": 0.3,
+        "origin": {"latitude": float(fix.latitude_deg[first]),
+                   "longitude": float(fix.longitude_deg[first]),
+                   "height": float(np.median(fix.height[valid]))}})
+    lines = [f"Husky (cra-ros-pkg/robot_localization, BSD): {len(imu)} Imu samples, {len(valid)} "
+             f"fixes, whose height spans {np.ptp(fix.height[valid]):.0f} m.", "",
+             "| | iterations | height of the trajectory, span m | vertical sd m, median | RMS of "
+             "normalised fix innovations |", "|---|---|---|---|---|"]
+    for name, params, surface in (("white fixes", BASE, None), ("wandering fixes", WANDER, None),
+                                  ("wandering fixes, plane", WANDER, plane)):
+        try:
+            result = Smoother(params, surface).run(imu, None, fix)
+        except ImuFusionError as error:
+            lines.append(f"| {name} | - | {error} | | |")
+            continue
+        s = result.samples
+        state = "" if result.converged else " (did not converge)"
+        rms = np.sqrt(np.mean(result.innovations["fix"][1] ** 2, axis=0))
+        lines.append(f"| {name} | {result.iterations}{state} | "
+                     f"{np.ptp(s['position_world'][:, 2]):.1f} | "
+                     f"{np.median(np.sqrt(s['cov_position'][:, 2, 2])):.2f} | "
+                     + "/".join(f"{r:.2f}" for r in rms) + " |")
+    write("smoother_ground", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
