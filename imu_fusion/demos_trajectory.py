@@ -17,8 +17,8 @@ from imu_fusion.messages.convert import read_log, string_value
 from imu_fusion.messages.smoothing import FIX_TOPIC, SMOOTHED_FIX_TOPIC, VELOCITY_TOPIC
 from imu_fusion.report.recording import write_recording_report
 
-# The drive: how much of it, and the stretches without GNSS, s.
-_DURATION, _LENGTH, _COUNT = 300.0, 15.0, 6
+# The drive: its stretches without GNSS, s, as in benchmarks/smoother_drive.py.
+_LENGTH, _COUNT, _FIRST, _LAST = 15.0, 11, 60.0, -45.0
 _FIXED = 2  # NavSatStatus of RTK solutions with fixed ambiguities
 
 
@@ -41,7 +41,7 @@ def shared(folder):
 def drive(out, console):
     """A car with RTK fixes, some stretches of which are withheld and serve as the truth."""
     bag, params_file = shared("bags") / "drive_0708", shared("config") / "drive_0708.yaml"
-    withheld, truth = out / "withheld", None
+    withheld = out / "withheld"
     with open_bag(bag) as reader:
         truth = read_log(reader, FIX_TOPIC)
         stretches = _write_withheld(reader, withheld)
@@ -68,14 +68,14 @@ def drive(out, console):
 
 
 def _write_withheld(reader, path):
-    """Write the beginning of a recording without GNSS in some stretches: [(start, end)] ns."""
+    """Write a recording without GNSS in some stretches; returns these: [(start, end)] ns."""
     first = reader.start_time
+    duration = (reader.end_time - first) * 1e-9
     stretches = [(first + round(start * 1e9), first + round((start + _LENGTH) * 1e9))
-                 for start in np.linspace(45.0, _DURATION - 30.0, _COUNT)]
+                 for start in np.linspace(_FIRST, duration + _LAST, _COUNT)]
     gnss = {f"/{FIX_TOPIC}", f"/{VELOCITY_TOPIC}"}
     with BagWriter(path, overwrite=True) as writer:
-        for topic, msgtype, stamp, cdr in reader.messages(None, first,
-                                                          first + round(_DURATION * 1e9)):
+        for topic, msgtype, stamp, cdr in reader.messages():
             if topic not in gnss or not any(a <= stamp < b for a, b in stretches):
                 writer.write(topic, msgtype, cdr, stamp)
     return stretches

@@ -300,6 +300,8 @@ def _before_after(smoothed):
 
 def _innovations(smoothed):
     """Normalised innovations with their bounds, and whether they are white."""
+    if not smoothed.result.innovations:
+        return Section("Innovations", (Text(f"The method {smoothed.params.method} gives none."),))
     rows, panels = [], []
     for name, (stamp, values) in smoothed.result.innovations.items():
         what, parts = _INNOVATIONS[name]

@@ -11,7 +11,7 @@ from imu_fusion.surfaces.hill import Hill
 _LEAST_HEIGHT = 0.12
 _SURFACE = "#c9d3dc"
 _CELLS = 60
-_SIZE = 1.7  # of the longest side of the drawn box, in plotly's units
+_SIZE = 1.35  # of the longest side of the drawn box, in plotly's units
 
 
 def thinned(*columns):
@@ -77,7 +77,7 @@ def _side_view(position_world):
     _, directions = np.linalg.eigh(centred.T @ centred)
     across = directions[:, 0]
     across = across if across[1] < 0 else -across
-    return float(1.5 * across[0]), float(1.5 * across[1]), 0.7
+    return float(1.55 * across[0]), float(1.55 * across[1]), 0.85
 
 
 def _xyz(points):

@@ -250,7 +250,7 @@ def test_a_real_browser_draws_every_figure_offline(tmp_path):
          "--virtual-time-budget=20000", "--dump-dom", out.as_uri()],
         check=True, capture_output=True, text=True, timeout=120).stdout
     figures = len(Page(out.read_text()).figures)
-    assert figures == 4
+    assert figures == 11
     # plotly marks every element that it has drawn into, and puts one layer of axes there.
     assert len(re.findall(r'<div class="plot[^>]*js-plotly-plot', drawn)) == figures
     assert drawn.count('class="cartesianlayer"') == figures
