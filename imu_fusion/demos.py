@@ -102,7 +102,7 @@ def _error_table(errors, moving):
     return table
 
 
-def acceleration_field(out, console):
+def impact(out, console):
     """Recover a gyroscope that clips at 1000 deg/s by eight accelerometers (mimu4444)."""
     bag = bags_directory() / "mimu4444"
     preset = bags_directory().parent / "config" / "mimu4444.yaml"
@@ -135,13 +135,16 @@ def acceleration_field(out, console):
         table.add_row(name, str(len(error)), f"{np.sqrt(np.mean(error ** 2)):.2f}",
                       f"{np.median(np.abs(error)):.2f}")
     console.print(table)
-    console.print(f"recordings: {recording}, {smoothed}")
+    for path, parameters in ((recording, preset), (smoothed, preset_smoothed)):
+        write_orientation_report(bag, path, out / f"{path.name}.html", parameters)
+    console.print(f"recordings: {recording}, {smoothed}\nreports:    {out / 'recording.html'}, "
+                  f"{out / 'smoothed.html'}")
 
 
 # rad/s; from about here on some of the eight gyroscopes of the board clip themselves.
 _MIMU_RANGE = 34.0
 
-DEMOS = {"orientation": orientation, "acceleration_field": acceleration_field}
+DEMOS = {"orientation": orientation, "impact": impact}
 
 
 def run(name, out, console):
