@@ -51,17 +51,23 @@ def _field(data, time):
         rows.append((_place(point), number(magnitude[peak, k], 2), number(time[peak], 3),
                      number(np.sqrt(np.mean(magnitude[:, k] ** 2)), 2),
                      number(np.linalg.norm(force[:, k], axis=1).max(), 2)))
-    at_origin = np.sqrt(np.trace(data.rows["cov_acceleration_world"], axis1=1, axis2=2))
+    stated = [(words, np.sqrt(np.trace(data.rows[name], axis1=1, axis2=2)), color)
+              for words, name, color in (
+                  ("σ of the specific force", "cov_specific_force", fig.SECONDARY),
+                  ("σ of the kinematic acceleration in the world", "cov_acceleration_world",
+                   fig.NEUTRAL))]
     panels = [
         Panel("kinematic in m/s²", tuple(Line(_place(p), time, magnitude[:, k], fig.SERIES[k])
                                          for k, p in enumerate(points[:_POINTS])), from_zero=True),
         Panel("specific force in m/s²", tuple(
             Line(_place(p), time, np.linalg.norm(force[:, k], axis=1), fig.SERIES[k])
             for k, p in enumerate(points[:_POINTS])), from_zero=True),
-        Panel("σ at the origin in m/s²", (Line("σ of the kinematic acceleration", time, at_origin,
-                                               fig.NEUTRAL),), from_zero=True)]
+        Panel("σ at the origin in m/s²", tuple(Line(words, time, sd, color)
+                                               for words, sd, color in stated), from_zero=True)]
     words = ("Magnitudes at the query points. The specific force is what accelerometers there "
-             "would feel and needs no orientation; the kinematic acceleration is without gravity.")
+             "would feel and needs no orientation; the kinematic acceleration is without gravity. As "
+             "a vector in the world it shares the uncertainty of the orientation, which turns it "
+             "and hardly changes its magnitude.")
     return Section("Acceleration field", (
         Numbers((Number("Samples", str(len(time))),
                  Number("Peak acceleration", f"{magnitude.max():.1f} m/s²", "kinematic, all points"),
@@ -116,9 +122,10 @@ def field_picture(data, time, magnitude):
     fig.style(figure, 620)
     middle_place = places.mean(axis=0)
     figure.update_layout(
-        scene=dict(aspectmode="cube", camera=dict(eye=dict(x=1.1, y=1.1, z=0.8)), **{
+        scene=dict(aspectmode="cube", camera=dict(
+            eye=dict(x=1.25, y=1.25, z=0.85), center=dict(x=0, y=0, z=-0.12)), **{
             f"{axis}axis": dict(title=f"{axis} in m", range=[
-                float(middle_place[i] - 1.7 * reach), float(middle_place[i] + 1.7 * reach)])
+                float(middle_place[i] - 1.4 * reach), float(middle_place[i] + 1.4 * reach)])
             for i, axis in enumerate("xyz")}),
         legend=dict(orientation="h", x=0, y=1.02, yanchor="bottom"),
         sliders=[dict(active=middle, steps=steps, currentvalue=dict(prefix="time in s: "),
@@ -144,8 +151,8 @@ def _rates(data, time, clipped):
     rows = data.rows
     panels = []
     for name, unit, values, cov, measured in (
-            ("rate", "rad/s", rows["omega"], rows["cov_omega"], data.gyr),
-            ("angular acc.", "rad/s²", rows["alpha"], rows["cov_alpha"], None)):
+            ("ω", "rad/s", rows["omega"], rows["cov_omega"], data.gyr),
+            ("α", "rad/s²", rows["alpha"], rows["cov_alpha"], None)):
         sd = np.sqrt(np.maximum(np.einsum("nii->ni", cov), 0.0))
         for i, axis in enumerate("xyz"):
             items = [Band("±1σ stated", time, values[:, i] - sd[:, i], values[:, i] + sd[:, i]),
