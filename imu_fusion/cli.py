@@ -125,7 +125,7 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
     if with_report:
         from imu_fusion.report.recording import write_recording_report
         path = Path(out) / "report.html"
-        write_recording_report(out, out, path, params_file)
+        write_recording_report(out, None, path, params_file)
         click.echo(f"written: {path}")
 
 
@@ -246,13 +246,16 @@ def _ros_args(**values):
 @click.argument("bag", type=click.Path())
 @click.option("--estimates", type=click.Path(),
               help="Recording with imu/data or acceleration_field/*, if not in BAG.")
-@click.option("--params-file", type=click.Path(),
-              help="Parameter file: places of accelerometers and query points.")
+@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
 def report(bag, estimates, params_file, out):
-    """Write an HTML report of BAG and its estimates, with a reference if BAG has one."""
-    from imu_fusion.report.recording import write_orientation_report
-    write_orientation_report(bag, estimates or bag, out, params_file)
+    """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
+
+    The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
+    recording of --estimates) holds imu/data. A reference in BAG shows the errors.
+    """
+    from imu_fusion.report.recording import write_recording_report
+    write_recording_report(bag, estimates, out, params_file)
     click.echo(f"written: {out}")
 
 
@@ -261,7 +264,11 @@ def report(bag, estimates, params_file, out):
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,
               help="Directory for recording and report.")
 def demo(name, out):
-    """Play a real recording through the nodes, record, compare, report."""
+    """Play a recording through the nodes, record, compare with the truth, report.
+
+    NAME: orientation (a sensor turned by hand), drive (a car, GNSS withheld for a while) or
+    jump (a simulated ski jump).
+    """
     from imu_fusion import demos
     demos.run(name, out, console)
 

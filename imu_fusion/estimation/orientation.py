@@ -187,18 +187,6 @@ class OrientationEstimator:
         self._waiting_imus = 0
         self._alignment = None
 
-    def set_params(self, params):
-        """Change parameters of a running estimator; what it has learned stays.
-
-        Raises:
-            ParameterError: another method or mode, which needs a new estimator.
-        """
-        for name in ("method", "mode"):
-            if getattr(params, name) != getattr(self.params, name):
-                raise ParameterError(f"parameter '{name}' cannot change while the estimator runs")
-        self.params = params
-        self._par = self._pack(params)
-
     def add_imu(self, stamp, gyr, acc):
         """Take one Imu sample.
 

@@ -13,7 +13,7 @@ from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.report.acceleration_field import field_picture, field_sections
 from imu_fusion.report.field_data import read_field
-from imu_fusion.report.recording import write_orientation_report
+from imu_fusion.report.recording import write_recording_report
 from test.report.test_report import EVIL, START, Page
 
 G = 9.80665
@@ -148,13 +148,13 @@ def test_picture_has_one_arrow_per_place_and_its_slider_shows_one_instant(data):
 
 def test_the_page_holds_the_sections_and_no_markup_from_outside(recording, tmp_path):
     bag, params = recording
-    write_orientation_report(bag, bag, tmp_path / "r.html", params)
+    write_recording_report(bag, bag, tmp_path / "r.html", params)
     page = Page((tmp_path / "r.html").read_text())
     for title in ("Acceleration field", "Residuals", "Impacts"):
         assert title in page.text
     assert not [tag for tag, _ in page.tags if tag in ("img", "i")]
     assert not re.search("angular velocity are not finite", page.text)
     # Without a parameter file nothing is known of the accelerometers, and the rest stands.
-    write_orientation_report(bag, bag, tmp_path / "r.html")
+    write_recording_report(bag, bag, tmp_path / "r.html")
     page = Page((tmp_path / "r.html").read_text())
     assert "Acceleration field" in page.text and "Residuals" not in page.text

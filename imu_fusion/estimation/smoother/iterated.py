@@ -16,6 +16,7 @@ import numpy as np
 
 from imu_fusion.estimation.smoother import kernel, model
 from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.transition import boxminus
 
 
 
@@ -105,7 +106,7 @@ class Problem:
             self.rows = evaluate_constraints(self.constraints, self.x[:, 0:3],
                                              self.imu.log.stamp, events, margin)
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
-        kernel.boxminus(self.prior, self.x[0], delta)
+        boxminus(self.prior, self.x[0], delta)
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
         covariances = np.empty((total if with_cov else 0, 3, 3, 3))
         variances = np.empty((total if with_cov else 0, n - 9))

@@ -19,7 +19,9 @@ from numba import njit
 from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE, FIX,
                                                   LEVER_ARM, POS, VEL, VELOCITY, interval,
                                                   predict_fix, predict_mag, predict_velocity)
-from imu_fusion.geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from imu_fusion.estimation.smoother.transition import (adjoint_rows, apply_step, boxminus,
+                                                       boxplus, interval_noise,
+                                                       propagate_rows, slow_noise)
 
 #: Longest list of non-zero entries of a row: all states, should one not be finite.
 MAX_ENTRIES = CORE + sum(width for _, width in BLOCKS)
@@ -29,88 +31,6 @@ SEGMENT = 128
 
 #: Variances of the slow states are computed for every so many samples.
 THINNING = 16
-
-
-@njit(cache=True)
-def boxplus(x, delta):
-    """State x (n + 1,) moved by an error state delta (n,), in place."""
-    turned = quat_multiply(x[6:10], quat_exp(delta[ATT:ATT + 3]))
-    turned /= math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2 + turned[3] ** 2)
-    x[6:10] = turned
-    for i in range(6):
-        x[i] += delta[i]
-    for i in range(9, len(delta)):
-        x[i + 1] += delta[i]
-
-
-@njit(cache=True)
-def boxminus(a, b, out):
-    """out (n,) with a = b [+] out, for states a, b (n + 1,)."""
-    out[ATT:ATT + 3] = quat_log(quat_multiply(quat_conjugate(b[6:10]), a[6:10]))
-    for i in range(6):
-        out[i] = a[i] - b[i]
-    for i in range(9, len(out)):
-        out[i] = a[i + 1] - b[i + 1]
-
-
-@njit(cache=True)
-def _propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
-    """out = F @ m for a matrix m (n, k)."""
-    n, width = m.shape
-    for i in range(3):
-        for j in range(width):
-            out[VEL + i, j] = m[VEL + i, j]
-            out[ATT + i, j] = 0.0
-        for c in columns:
-            v, a = f_vel[i, c], f_att[i, c]
-            for j in range(width):
-                out[VEL + i, j] += v * m[c, j]
-            if a != 0.0:
-                for j in range(width):
-                    out[ATT + i, j] += a * m[c, j]
-        for j in range(width):
-            out[POS + i, j] = m[POS + i, j] + 0.5 * dt * (m[VEL + i, j] + out[VEL + i, j])
-    for i in range(9, n):
-        for j in range(width):
-            out[i, j] = decay[i] * m[i, j]
-
-
-@njit(cache=True)
-def _adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
-    """out = F.T @ m for a matrix m (n, k)."""
-    n, width = m.shape
-    for i in range(3):
-        for j in range(width):
-            out[POS + i, j] = m[POS + i, j]
-            out[VEL + i, j] = m[VEL + i, j] + dt * m[POS + i, j]
-            out[ATT + i, j] = 0.0
-    for i in range(9, n):
-        for j in range(width):
-            out[i, j] = decay[i] * m[i, j]
-    for i in range(3):
-        for c in columns:
-            v, a = f_vel[i, c], f_att[i, c]
-            for j in range(width):
-                out[c, j] += v * (m[VEL + i, j] + 0.5 * dt * m[POS + i, j])
-            if a != 0.0:
-                for j in range(width):
-                    out[c, j] += a * m[ATT + i, j]
-
-
-@njit(cache=True)
-def _interval_noise(q_acc, middle, dt, spread):
-    """spread (3, 3): covariance of the velocity step in world axes."""
-    for i in range(3):
-        for j in range(3):
-            spread[i, j] = dt * (middle[i, 0] * middle[j, 0] * q_acc[0]
-                                 + middle[i, 1] * middle[j, 1] * q_acc[1]
-                                 + middle[i, 2] * middle[j, 2] * q_acc[2])
-
-
-@njit(cache=True)
-def _slow_noise(walk, rate, dt, factor):
-    """Variance that a slow state gains; factor is its decay over dt."""
-    return walk * dt if rate == 0.0 else 0.5 * walk / rate * (1.0 - factor * factor)
 
 
 @njit(cache=True)
@@ -255,15 +175,15 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
         else:
             boxminus(x_next, x[k + 1], defect)
             column[:, 0] = delta
-            _propagate_rows(column, column_out, dt, decay, f_vel, f_att, columns)
+            propagate_rows(column, column_out, dt, decay, f_vel, f_att, columns)
             for i in range(n):
                 delta[i] = column_out[i, 0] + defect[i]
-        _propagate_rows(cov, work, dt, decay, f_vel, f_att, columns)
+        propagate_rows(cov, work, dt, decay, f_vel, f_att, columns)
         for i in range(n):
             for j in range(n):
                 work_t[j, i] = work[i, j]
-        _propagate_rows(work_t, cov, dt, decay, f_vel, f_att, columns)
-        _interval_noise(noise[k, 3:6], middle, dt, spread)
+        propagate_rows(work_t, cov, dt, decay, f_vel, f_att, columns)
+        interval_noise(noise[k, 3:6], middle, dt, spread)
         for i in range(3):
             cov[ATT + i, ATT + i] += noise[k, i] * dt
             for j in range(3):
@@ -272,7 +192,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
                 cov[VEL + i, POS + j] += 0.5 * dt * spread[i, j]
                 cov[POS + i, POS + j] += 0.25 * dt * dt * spread[i, j]
         for i in range(9, n):
-            cov[i, i] += _slow_noise(walks[i], rates[i], dt, decay[i])
+            cov[i, i] += slow_noise(walks[i], rates[i], dt, decay[i])
         # The two products round differently on either side of the diagonal.
         for i in range(n):
             for j in range(i):
@@ -355,24 +275,24 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
                 decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
             _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, spin, decay,
                                  layout, f_vel, f_att, x_next, rate, force)
-            _interval_noise(noise[k, 3:6], middle, dt, spread)
+            interval_noise(noise[k, 3:6], middle, dt, spread)
             for i in range(3):
                 cost += noise[k, i] * dt * adjoint[ATT + i] ** 2
                 for j in range(3):
                     cost += (spread[i, j] * (adjoint[VEL + i] + 0.5 * dt * adjoint[POS + i])
                              * (adjoint[VEL + j] + 0.5 * dt * adjoint[POS + j]))
             for i in range(9, n):
-                cost += (_slow_noise(walks[i], rates[i], dt, decay[i])
+                cost += (slow_noise(walks[i], rates[i], dt, decay[i])
                          * adjoint[i] ** 2)
             column[:, 0] = adjoint
-            _adjoint_rows(column, column_out, dt, decay, f_vel, f_att, columns)
+            adjoint_rows(column, column_out, dt, decay, f_vel, f_att, columns)
             adjoint[:] = column_out[:, 0]
             if with_cov:
-                _adjoint_rows(adjoint_cov, work, dt, decay, f_vel, f_att, columns)
+                adjoint_rows(adjoint_cov, work, dt, decay, f_vel, f_att, columns)
                 for i in range(n):
                     for j in range(n):
                         work_t[j, i] = work[i, j]
-                _adjoint_rows(work_t, adjoint_cov, dt, decay, f_vel, f_att, columns)
+                adjoint_rows(work_t, adjoint_cov, dt, decay, f_vel, f_att, columns)
         cov, delta = s_cov[k - first], s_delta[k - first]
         for i in range(n):
             step[k - first, i] = delta[i]
@@ -441,18 +361,6 @@ def _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out):
         for m in range(n):
             total -= work[i, m] * cov[m, i]
         var_out[k, i - 9] = total
-
-
-@njit(cache=True)
-def apply_step(x, step, largest):
-    """Move states x (m, n + 1) by deviations step (m, n), in place; ``largest`` (3,) grows to
-    the largest change of position (m), velocity (m/s) and attitude (rad)."""
-    for k in range(len(x)):
-        boxplus(x[k], step[k])
-        for b in range(3):
-            size = math.sqrt(step[k, 3 * b] ** 2 + step[k, 3 * b + 1] ** 2
-                             + step[k, 3 * b + 2] ** 2)
-            largest[b] = max(largest[b], size)
 
 
 @njit(cache=True)

@@ -1,0 +1,80 @@
+"""What the fusion filter detects: gyroscope axes at their limit, and rest."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from imu_fusion.estimation import orientation_error_state as es
+from imu_fusion.estimation import orientation_state as st
+from imu_fusion.estimation.orientation_fusion_layout import (
+    COV, ENTRY, LARGEST, LIMIT, MEAN_FORCE, MEAN_RATE, N, P_REST_FORCE, P_REST_RATE,
+    P_REST_TIME, REPEATED, REPEATS, REST_SINCE, S)
+
+REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
+_REST_TURN = 1.5e-3         # rad/s per axis: slower turning than 0.5 deg/s passes as rest
+_REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
+_ENTRY_SHARE = 2e-3        # a flat top is run into; a quantised smooth peak is not
+_LIMIT_FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
+
+
+@njit(cache=True)
+def find_limits(x, k, par, gyr):
+    """Learn each axis' limit from flat tops, unless given; mark the axes at theirs."""
+    clipped = 0
+    # A driver that repeats whole samples makes no flat tops.
+    held = (gyr[0] == x[REPEATED] and gyr[1] == x[REPEATED + 1] and gyr[2] == x[REPEATED + 2])
+    for i in range(3):
+        size = abs(gyr[i])
+        if math.isnan(par[st.P_RANGE + i]):
+            if held:
+                pass
+            elif gyr[i] == x[REPEATED + i]:
+                k[REPEATS + i] += 1
+                if (k[REPEATS + i] >= _REPEATS_AT_LIMIT - 1 and size >= x[LARGEST + i]
+                        and x[ENTRY + i] > _ENTRY_SHARE * size > _ENTRY_SHARE * _LIMIT_FLOOR):
+                    x[LIMIT + i] = min(x[LIMIT + i], size)
+            else:
+                k[REPEATS + i] = 0
+                x[ENTRY + i] = abs(gyr[i] - x[REPEATED + i])
+            x[LARGEST + i] = max(x[LARGEST + i], size)
+            if size > x[LIMIT + i]:
+                x[LIMIT + i] = np.inf    # a repeated value that was no limit
+            x[REPEATED + i] = gyr[i]
+        if size >= x[LIMIT + i] * (1.0 - 1e-6):
+            clipped |= 1 << i
+    return clipped
+
+
+@njit(cache=True)
+def is_still(x, k, par, stamp, dt, gyr, acc):
+    """Rest: rate and force have kept to their short-term means, and the mean rate is bias.
+
+    Slow turning is told from rest by the bias' own uncertainty.
+    """
+    part = min(dt / REST_MEMORY, 1.0)
+    rate2 = 0.0
+    force2 = 0.0
+    mean2 = 0.0
+    limit2 = 0.0
+    for i in range(3):
+        x[MEAN_RATE + i] += part * (gyr[i] - x[MEAN_RATE + i])
+        x[MEAN_FORCE + i] += part * (acc[i] - x[MEAN_FORCE + i])
+        rate2 += (gyr[i] - x[MEAN_RATE + i]) ** 2
+        force2 += (acc[i] - x[MEAN_FORCE + i]) ** 2
+        mean2 += (x[MEAN_RATE + i] - x[S + es.BIAS + i]) ** 2
+        slot = COV + (es.BIAS + i) * (N + 1)
+        limit2 += x[slot] + _REST_TURN ** 2
+    if (rate2 > par[P_REST_RATE] ** 2 or force2 > par[P_REST_FORCE] ** 2
+            or mean2 > 9.0 * limit2):
+        k[REST_SINCE] = stamp
+    return stamp - k[REST_SINCE] > par[P_REST_TIME] * 1e9
+
+
+@njit(cache=True)
+def mean_rate(x, i):
+    """Low-passed rate of axis i, scaled, with its bias."""
+    rate = x[MEAN_RATE + i]
+    for j in range(3):
+        rate += x[S + es.SCALE + 3 * i + j] * x[MEAN_RATE + j]
+    return rate

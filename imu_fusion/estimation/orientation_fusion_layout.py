@@ -1,0 +1,41 @@
+"""Where the fusion kernel keeps its numbers: offsets into state and parameter arrays."""
+
+from imu_fusion.estimation import orientation_error_state as es
+from imu_fusion.estimation import orientation_state as st
+
+N = es.N
+# Float state.
+S = st.X_COMMON            # (N,) nominal values, in the order of the error state; attitude unused
+COV = S + N                # (N, N)
+NORM = COV + N * N         # field norm, tesla; 0 before the first sample
+GRAVITY = NORM + 1         # m/s^2
+HEADING_VAR = NORM + 2     # rad^2, of a heading that no magnetometer has fixed
+ACC_LAST = NORM + 3        # (3,)
+MEAN_RATE = NORM + 6       # (3,) low-passed raw rate, for the rest detector
+MEAN_FORCE = NORM + 9      # (3,)
+MOVE = NORM + 12           # the block being collected
+MAG_SUM = MOVE + es.MOVE_SIZE   # (3,) world axes; then lag (3,), offset (9,), matrix (27,)
+MAG_ROWS = 42
+LIMIT = MAG_SUM + MAG_ROWS  # (3,) gyroscope limits found
+REPEATED = LIMIT + 3       # (3,) last value of each axis
+ENTRY = REPEATED + 3       # (3,) step with which it was reached
+LARGEST = ENTRY + 3        # (3,) largest rate seen
+SWAY = LARGEST + 3         # (3,) world acceleration through a leaky integral, m/s
+MOTION = SWAY + 3          # mean square of SWAY per axis, (m/s)^2
+X_SIZE = MOTION + 1
+
+# Integer state.
+BLOCK_MAGS = st.K_COMMON
+REST_SINCE = BLOCK_MAGS + 1
+CLIPPED = BLOCK_MAGS + 2   # bit per axis at its limit
+WAS_CLIPPED = BLOCK_MAGS + 3  # the same in the block before
+REPEATS = BLOCK_MAGS + 4   # (3,) how often each axis repeated its largest value
+WORLD_TURNED = REPEATS + 3  # the heading was fixed in this block
+K_SIZE = WORLD_TURNED + 1
+
+# Parameters.
+(P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,
+ P_FIELD_WALK, P_MAG_RELATIVE, P_NORM_FACTOR, P_REST_RATE, P_REST_FORCE, P_REST_TIME,
+ P_REST_RATE_SD, P_EXCESS_WALK, P_ESTIMATE_BIAS, P_SCALE_SD, P_OFFSET_SD, P_SOFT_SD,
+ P_LAG_SD, P_FOLLOW_FIELD, P_HEADING_SD, P_USE_ACC) = range(st.P_COMMON, st.P_COMMON + 24)
+P_SIZE = st.P_COMMON + 24
