@@ -19,7 +19,7 @@ peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report, *terrain]
 
 nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
-         "acceleration_field_estimator"]
+         "acceleration_field_estimator", "pipeline"]
 
 setup(
     name=package_name,
@@ -52,6 +52,6 @@ setup(
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
     ]},
-    package_data={"imu_fusion.report": ["*.css", "*.js"]},
+    package_data={"imu_fusion.report": ["*.css", "*.js"], "imu_fusion.nodes.flow": ["*.xml"]},
     zip_safe=False,
 )

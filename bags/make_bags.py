@@ -23,8 +23,12 @@ from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.acceleration_field_calibration import calibrate_array
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import (
-    bool_message, fix_message, imu_message, mag_message, pose_message, velocity_message)
-from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
+    bool_message, fix_message, imu_message, mag_message, pose_message, string_message,
+    velocity_message)
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, STRING_TYPE, TWIST
+from imu_fusion.simulation.jump_sensors import record
+from imu_fusion.simulation.ski_jump import SkiJump
+from imu_fusion.surface_file import load_surface
 
 HERE = Path(__file__).resolve().parent
 IMU_FRAME = "imu_link"
@@ -230,6 +234,35 @@ def mimu4444(source):
             (t, imu_message(t, IMU_FRAME, None, a)) for t, a in zip(stamp, acc[:, k])]
 
 
+def simulated_jump(source):
+    """Topics of a simulated ski jump, with its truth; nothing of it was measured."""
+    jump = SkiJump(load_surface("oberstdorf_hs106"))
+    recording = record(jump, np.random.default_rng(2018))
+    imu, mag, fix, velocity = (recording.imu, recording.mag, recording.fix, recording.velocity)
+    yield "imu/data_raw", IMU.msgtype, [
+        (t, imu_message(t, IMU_FRAME, g, a)) for t, g, a in zip(imu.stamp, imu.gyr, imu.acc)]
+    yield "imu/mag", MAG.msgtype, [
+        (t, mag_message(t, IMU_FRAME, m)) for t, m in zip(mag.stamp, mag.mag)]
+    yield "fix", FIX.msgtype, [
+        (t, fix_message(t, GNSS_FRAME, latitude, longitude, height, cov))
+        for t, latitude, longitude, height, cov in zip(
+            fix.stamp, fix.latitude_deg, fix.longitude_deg, fix.height, fix.cov_enu)]
+    yield "fix_velocity", TWIST.msgtype, [
+        (t, velocity_message(t, WORLD_FRAME, v, cov)) for t, v, cov in zip(
+            velocity.stamp, velocity.vel_world, velocity.cov_world)]
+    motion = recording.motion
+    yield "reference/pose", POSE.msgtype, [
+        (t, pose_message(t, WORLD_FRAME, q, p))
+        for t, q, p in zip(imu.stamp, motion.quat_world_imu, motion.position_world)]
+    truth = {"length": round(float(jump.length), 4), "flight_time": round(
+        float(jump.t_touchdown - jump.t_takeoff), 5)}
+    for name, time in (("takeoff", jump.t_takeoff), ("touchdown", jump.t_touchdown)):
+        truth[f"{name}_stamp"] = int(imu.stamp[0] + round(time * 1e9))
+        at = jump.at(np.array([time]))
+        truth[f"{name}_speed"] = round(float(np.linalg.norm(at.vel_world)), 4)
+    yield "reference/jump", STRING_TYPE, [(imu.stamp[0], string_message(json.dumps(truth)))]
+
+
 def _broad(name, trial, title):
     return Recording(
         name, title, "[dlaidig/broad](https://github.com/dlaidig/broad), trial "
@@ -265,6 +298,11 @@ RECORDINGS = {r.name: r for r in (
               "Copyright (c) 2021 Håkan Carlsson. Changed: units, calibration from the static poses, "
               "axes of all chips turned into those of chip 0, gyroscopes averaged, format",
               ("mimu4444/exp1_dynamic.npz",), mimu4444),
+    Recording("jump_simulated", "SIMULATED ski jump on the profile of Oberstdorf HS106: a phone "
+              "and a GNSS logger with the errors of Fang et al. (2020), tables 3 to 5; nothing "
+              "of it was measured",
+              "`imu_fusion.simulation` (ski_jump, jump_sensors), seed 2018", "Apache-2.0",
+              "../LICENSE", "imu_fusion maintainers", (), simulated_jump),
 )}
 
 

@@ -74,8 +74,8 @@ def clipped_gyroscope(run):
     for mode in ("causal", "smoothed"):
         estimator = AccelerationFieldEstimator(
             fit.fitted.replace(mode=mode, maximum_likelihood="off",
-                               smoother__iterations=BEGIN.smoother__iterations), sensors(positions, noise),
-            gyroscope)
+                               smoother__iterations=BEGIN.smoother__iterations),
+            sensors(positions, noise), gyroscope)
         rows = estimator.run(stamp, acc, given)
         begin = len(stamp) - len(rows)
         use = judged[begin:]

@@ -45,7 +45,7 @@ def plain_paper(t, readings, positions, axes, omega):
     return np.array(out)
 
 
-def _data():
+def case():
     motion = simulate(duration=(SAMPLES - 1) * 1e-3)
     clean = motion.readings(PAPER_POSITIONS, PAPER_AXES, "acceleration")
     return motion, noisy(clean, 10, np.random.default_rng(0))
@@ -54,18 +54,18 @@ def _data():
 def _time(call, repeats=3):
     best = np.inf
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin = time.process_time()
         call()
-        best = min(best, time.perf_counter() - begin)
+        best = min(best, time.process_time() - begin)
     return best
 
 
 def cold(change):
     """Seconds of a first run in a fresh process with an empty compilation cache."""
-    code = ("import time; from benchmarks.acceleration_field_speed import *; m, r = _data(); "
-            "b = time.perf_counter(); "
+    code = ("import time; from benchmarks.acceleration_field_speed import *; m, r = case(); "
+            "b = time.process_time(); "
             f"AccelerationFieldEstimator(PARAMS.replace(**{change!r}), paper_sensors(10)).run("
-            "m.stamp, r); print(time.perf_counter() - b)")
+            "m.stamp, r); print(time.process_time() - b)")
     with tempfile.TemporaryDirectory() as folder:
         return float(subprocess.run(
             [sys.executable, "-c", code], check=True, capture_output=True, text=True,
@@ -74,7 +74,7 @@ def cold(change):
 
 def main():
     """Write the table."""
-    motion, readings = _data()
+    motion, readings = case()
     peer = _time(lambda: plain_paper(motion.t, readings, PAPER_POSITIONS, PAPER_AXES,
                                      np.full(3, 5.0)))
     table = [["paper, plain numpy", f"{1e6 * peer / SAMPLES:.1f}", "1", "", ""]]
@@ -107,7 +107,8 @@ def main():
     write_table("acceleration_field_speed",
                 ["method", "us per sample, warm", "times the plain numpy speed",
                  "us per sample, live add()", "first run with compilation, s"], table,
-                f"Four accelerometers, {SAMPLES} samples, one core.")
+                f"Four accelerometers, {SAMPLES} samples, one core; CPU time, so that other work on the "
+                "machine does not count.")
 
 
 if __name__ == "__main__":

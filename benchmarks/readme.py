@@ -13,7 +13,15 @@ from imu_fusion.parameters import markdown_table
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).parent / "results"
-IN_README = ("orientation_broad", "orientation_speed", "replay")
+IN_README = {
+    "orientation_broad": "Orientation on BROAD (9 trials, optical reference)",
+    "orientation_clipping": "Saturated gyroscopes",
+    "orientation_speed": "Speed of the orientation step",
+    "replay": "Ten minutes at rate 0 through replayer, orientation_estimator and recorder",
+    "acceleration_field_independent": "Acceleration field of the simulated impact, independent noise",
+    "acceleration_field_clipped": "Clipped gyroscopes filled in by accelerometers (real data)",
+    "smoother_jump": "Simulated ski jump",
+    "smoother_drive": "Car drive against RTK"}
 
 
 def parameters():
@@ -29,12 +37,23 @@ def parameters():
     return "\n".join(parts)
 
 
+def _command(name):
+    """The module of benchmarks/ that writes this table."""
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        if file.stem == name:
+            return name
+    (file,) = [f for f in Path(__file__).parent.glob("*.py")
+               if f.stem != "readme" and f'"{name}' in f.read_text()]
+    return file.stem
+
+
 def results():
     """The tables that the benchmarks have written."""
     parts = []
-    for name in IN_README:
+    for name, title in IN_README.items():
         file = RESULTS / f"{name}.md"
         if file.exists():
+            parts.append(f"### {title}\n\n`python -m benchmarks.{_command(name)}`\n")
             parts.append(file.read_text().strip() + "\n")
     return "\n".join(parts)
 

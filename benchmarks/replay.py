@@ -80,7 +80,7 @@ def main(runs=10):
         "repeated) at rate 0 through replayer, orientation_estimator and recorder: three "
         f"processes over Fast DDS on {os.cpu_count()} cores that others used too (load: mean "
         f"number of processes that want a core, ours included). {messages} messages recorded per run, "
-        "compared by their stamps.",
+        "compared by their stamps. The first run may compile kernels.",
         "",
         "| run | lost imu/data_raw | lost imu/mag | lost imu/data | first to last message s | "
         "with start and end s | CPU s of the three | load | real-time factor | "

@@ -99,11 +99,20 @@ def stages():
     )}
 
 
-def _configure_field(stage, params_file):
-    values = node_values(stage.node, params_file, field_stream.FieldConfiguration.names())
+def field_configuration(params_file):
+    """The FieldConfiguration of the acceleration field estimator in a parameter file (or None).
+
+    Raises:
+        ParameterError, LayoutError: with the name of what is wrong.
+    """
+    values = node_values(field_stream.NODE, params_file, field_stream.FieldConfiguration.names())
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
-    config = field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
+    return field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
+
+
+def _configure_field(stage, params_file):
+    config = field_configuration(params_file)
     gyroscope = [field_stream.GYROSCOPE_TOPIC] * (config.gyroscope is not None)
     return replace(
         stage, kinds=config.inputs, optional=_types(config.inputs, gyroscope),
@@ -148,14 +157,9 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
             if stage.unusable:
                 report.skipped = stage.unusable
                 continue
-            names = {}
-            for topic, msgtype in {**stage.required, **stage.optional}.items():
-                name = find_topic(reader.topics, remap.get(topic, topic))
-                if name is not None and reader.topics[name].count:
-                    names[topic] = reader.require(name, msgtype).name
-            missing = [topic for topic in stage.required if topic not in names]
+            names, missing = inputs_of(stage, reader, remap)
             if missing:
-                report.skipped = explain_missing(reader, {t: stage.required[t] for t in missing})
+                report.skipped = missing
             else:
                 chosen.append((stage, report, names))
         if not chosen:
@@ -188,6 +192,29 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         found = {report.node: report.results for report in reports if report.results}
         (writer.directory / "results.json").write_text(json.dumps(found, indent=2))
     return reports, list(dict.fromkeys(warnings))
+
+
+def inputs_of(stage, reader, remap):
+    """Where a recording holds the topics of a stage.
+
+    Args:
+        stage: Stage. reader: an open recording.
+        remap: dict of topic names of ours to those in the recording.
+
+    Returns:
+        dict of our topic to its name in the recording, and words for required ones that it
+        lacks, '' if none.
+
+    Raises:
+        TopicError: a topic has another type.
+    """
+    names = {}
+    for topic, msgtype in {**stage.required, **stage.optional}.items():
+        name = find_topic(reader.topics, remap.get(topic, topic))
+        if name is not None and reader.topics[name].count:
+            names[topic] = reader.require(name, msgtype).name
+    missing = {t: stage.required[t] for t in stage.required if t not in names}
+    return names, explain_missing(reader, missing)
 
 
 def _read(reader, names, kinds):

@@ -107,6 +107,30 @@ def process(bag, out, params_file, without, remap, overwrite):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
+@click.option("--without", multiple=True, metavar="NODE", help="Leave an estimator out. Repeatable.")
+@click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
+@remap_option
+@overwrite_option
+def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
+    """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
+
+    Each node is a process of an own ROS domain. OUT holds what was played and the estimates,
+    the same as those of `process`.
+    """
+    from imu_fusion import pipeline as nodes
+    nodes.run(bag, out, params_file, without, _remaps(remap), overwrite)
+    click.echo(f"written: {out}")
+    if with_report:
+        from imu_fusion.report.recording import write_recording_report
+        path = Path(out) / "report.html"
+        write_recording_report(out, None, path, params_file)
+        click.echo(f"written: {path}")
+
+
+@cli.command()
+@click.argument("bag", type=click.Path())
 @click.option("--repair", "target", type=click.Path(), metavar="OUT",
               help="Copy all that can be read into a clean recording OUT.")
 def info(bag, target):
@@ -139,13 +163,24 @@ def _number(value, form):
 @click.argument("source", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
+@click.option("--csv", "description", type=click.Path(), metavar="YAML",
+              help="SOURCE is a table of accelerometers; YAML names its columns, units, positions "
+                   "and axes.")
 @remap_option
 @overwrite_option
-def convert(source, out, topics, remap, overwrite):
+def convert(source, out, topics, description, remap, overwrite):
     """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
 
-    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT.
+    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With --csv
+    SOURCE is a table, and OUT.yaml becomes the parameter file that process takes.
     """
+    if description is not None:
+        if topics or remap:
+            raise click.UsageError("--csv goes without --topic and --remap")
+        from imu_fusion.messages.csv_import import import_csv
+        parameter_file, count = import_csv(source, description, out, overwrite)
+        click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
+        return
     from imu_fusion.messages.bag import BagWriter, open_bag
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
@@ -209,12 +244,18 @@ def _ros_args(**values):
 
 @cli.command()
 @click.argument("bag", type=click.Path())
-@click.option("--estimates", type=click.Path(), help="Recording with imu/data, if not in BAG.")
+@click.option("--estimates", type=click.Path(),
+              help="Recording with imu/data or acceleration_field/*, if not in BAG.")
+@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
-def report(bag, estimates, out):
-    """Write an HTML report of BAG and its estimates, with a reference if BAG has one."""
-    from imu_fusion.report.recording import write_orientation_report
-    write_orientation_report(bag, estimates or bag, out)
+def report(bag, estimates, params_file, out):
+    """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
+
+    The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
+    recording of --estimates) holds imu/data. A reference in BAG shows the errors.
+    """
+    from imu_fusion.report.recording import write_recording_report
+    write_recording_report(bag, estimates, out, params_file)
     click.echo(f"written: {out}")
 
 
@@ -223,7 +264,11 @@ def report(bag, estimates, out):
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,
               help="Directory for recording and report.")
 def demo(name, out):
-    """Play a real recording through the nodes, record, compare, report."""
+    """Play a recording through the nodes, record, compare with the truth, report.
+
+    NAME: orientation (a sensor turned by hand), drive (a car, GNSS withheld for a while) or
+    jump (a simulated ski jump).
+    """
     from imu_fusion import demos
     demos.run(name, out, console)
 

@@ -77,7 +77,7 @@ class Graph:
             node: module name in imu_fusion.nodes.
             show: let it print here instead of into its log.
             params_file: ROS 2 parameter file.
-            parameters: its parameters.
+            parameters: its parameters; empty tuples, which rclpy cannot read, are left out.
         """
         command = [sys.executable, "-m", "imu_fusion.cli", "run", node, "--ros-args"]
         if params_file is not None:
@@ -85,7 +85,8 @@ class Graph:
         if parameters:
             own = self._logs / f"{node}.yaml"
             own.write_text(yaml.safe_dump({node: {"ros__parameters": {
-                k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}}}))
+                k: list(v) if isinstance(v, tuple) else v
+                for k, v in parameters.items() if v != ()}}}))
             command += ["--params-file", str(own)]
         environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain),
                            ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", PYTHONUNBUFFERED="1")

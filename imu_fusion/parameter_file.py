@@ -67,14 +67,33 @@ def parameters_for(classes, node, path=None, ignore=()):
         return [cls() for cls in classes]
     known = {info.name for cls in classes for info in cls.infos()}
     values = node_values(node, path, known)
+    resolve_paths(values, classes, node, [path])
     result = []
     for cls in classes:
         own = {info.name for info in cls.infos()}
-        for info in cls.infos():
-            if info.path and values.get(info.name):
-                values[info.name] = resolve(values[info.name], path)
         result.append(cls.from_mapping(values, source=str(path), ignore=(*ignore, *(known - own))))
     return result
+
+
+def resolve_paths(values, classes, node, paths):
+    """Relative file names that parameter files set become relative to those files.
+
+    Args:
+        values: flat mapping of parameter names to values, changed in place. A file name that
+            does not exist beside the parameter file stays as it is.
+        classes, node: as for :func:`parameters_for`.
+        paths: the parameter files that the values may come from, the last one counts.
+    """
+    names = {info.name for cls in classes for info in cls.infos() if info.path}
+    settings = [(path, node_values(node, path, names)) for path in paths]
+    for name in names:
+        value = values.get(name)
+        for path, own in reversed(settings):
+            if value and own.get(name) == value:
+                candidate = Path(path).absolute().parent / value
+                if candidate.exists():
+                    values[name] = str(candidate)
+                break
 
 
 def node_values(node, path, known):
@@ -89,9 +108,3 @@ def node_values(node, path, known):
     values.update(flatten(nodes.get(node, {})))
     values.pop("use_sim_time", None)
     return values
-
-
-def resolve(value, parameter_file):
-    """A path from a parameter file: relative ones are relative to the file, if that exists."""
-    candidate = Path(parameter_file).parent / value
-    return str(candidate) if not Path(value).is_absolute() and candidate.exists() else value

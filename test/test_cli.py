@@ -37,7 +37,8 @@ def call(*arguments):
 
 def test_help_names_every_command_and_what_it_does():
     output = call("--help").output
-    for command in ("run", "process", "play", "record", "info", "convert", "report", "demo"):
+    for command in ("run", "process", "play", "record", "info", "convert", "report", "demo",
+                    "pipeline"):
         assert re.search(rf"^  {command} +\w", output, re.MULTILINE)
 
 

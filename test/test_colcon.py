@@ -113,8 +113,10 @@ def test_launch_files_compile_and_name_our_executables(path):
     assert executables and executables <= set(NODES)
 
 
-def test_parameters_of_the_launch_file_are_those_of_the_nodes():
-    for name, content in yaml.safe_load((REPOSITORY / "config/replay.yaml").read_text()).items():
+@pytest.mark.parametrize("file", ["replay", "pipeline"])
+def test_parameters_of_the_launch_file_are_those_of_the_nodes(file):
+    path = REPOSITORY / f"config/{file}.yaml"
+    for name, content in yaml.safe_load(path.read_text()).items():
         module = importlib.import_module(f"imu_fusion.nodes.{name}")
         cls, = {c for c in vars(module).values()
                 if isinstance(c, type) and issubclass(c, Node) and c.NAME == name}

@@ -87,7 +87,8 @@ class AccelerationFieldParams(Parameters):
     smoother__iterations: int = param(
         4, low=1, high=100, doc="Most iterations of the smoother.")
     max_gap: float = param(
-        0.1, unit="s", low=0, doc="Longer intervals between samples are flagged as gaps.")
+        0.1, unit="s", low=0,
+        doc="Across longer intervals nothing is integrated: rate and attitude are held.")
     max_condition: float = param(
         1e3, low=1, doc="Layouts of a larger condition number are refused.")
     gravity: float = param(9.80665, unit="m/s^2", low=0, doc="Gravity at the place.")
@@ -166,8 +167,8 @@ class AccelerationFieldEstimator:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else {
                     k: v.copy() for k, v in self._filter.state.items()},
-                "start": self._start, "rest": self._rest, "last": self._last, "stamps": list(self._stamps),
-                "readings": list(self._readings)}
+                "start": self._start, "rest": self._rest, "last": self._last,
+                "stamps": list(self._stamps), "readings": list(self._readings)}
 
     def set_state(self, state):
         """Go on from where :meth:`get_state` was called, in an estimator of equal parameters."""
@@ -270,7 +271,10 @@ class AccelerationFieldEstimator:
         if is_still(self.params, self.layout, np.concatenate(self._readings)):
             self._begin()
             return
-        del self._stamps[0], self._readings[0]
+        # A quarter of the window at a time: looking again at every sample would cost more than
+        # the estimate itself.
+        quarter = max(1, len(self._stamps) // 4)
+        del self._stamps[:quarter], self._readings[:quarter]
 
     def _begin(self):
         self._rest = np.concatenate(self._readings) if self._readings else None

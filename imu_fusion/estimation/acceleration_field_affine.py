@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
+from imu_fusion.estimation.acceleration_field_kernel import gap_variance
 from imu_fusion.estimation.acceleration_field_rows import (GAP, HELD, MISSING, SATURATED, VALUES,
                                                            put_row, rigid_gradient)
 from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
@@ -19,9 +20,9 @@ from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normaliz
 
 AO, SQRT_AO = 0, 1
 # Layout of the state vector: quaternion, omega, alpha of this and of the previous sample, a,
-# gradient, previous step in s, number of samples seen.
-QUAT, RATE, ALPHA, ALPHA_BEFORE, ACC, GRADIENT, STEP, COUNT = 0, 4, 7, 10, 13, 16, 25, 26
-STATE = 27
+# previous step in s, samples since the start or a gap.
+QUAT, RATE, ALPHA, ALPHA_BEFORE, ACC, STEP, COUNT = 0, 4, 7, 10, 13, 16, 17
+STATE = 18
 
 
 @njit(cache=True)
@@ -110,16 +111,16 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
             values, flags):
     """Take samples in order; one row of values and flags each.
 
-    state: (27,), cov: (18, 18) as in the rigid-body kernel but for alpha and a of the latest fit
+    state: (18,), cov: (18, 18) as in the rigid-body kernel but for alpha and a of the latest fit
     alone, last: (1,) int64 stamp, all in place.
-    readings: (n, m) channels, NaN for missing and inf for saturated ones. design: (m, 12), its columns multiplied
-    by scale (12,).
+    readings: (n, m) channels, NaN for missing and inf for saturated ones. design: (m, 12), its
+    columns multiplied by scale (12,).
     """
     m = readings.shape[1]
     used = np.ones(m, np.bool_)
     sd = density * math.sqrt(sample_rate)
-    operator, covariance, determined, full = fit_operator(design, 1.0 / sd, used, max_condition)
-    whole = used.copy()
+    operator, covariance, determined, full = fit_operator(
+        design, 1.0 / sd, used, max_condition)
     current = used.copy()
     x = np.zeros(18)
     for n in range(len(stamp)):
@@ -135,10 +136,17 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
             current[:] = used
             operator, covariance, determined, full = fit_operator(
                 design, 1.0 / sd, used, max_condition)
-        first = state[COUNT] == 0.0
-        dt = 0.0 if first else (stamp[n] - last[0]) * 1e-9
+        dt = 0.0 if last[0] < 0 else (stamp[n] - last[0]) * 1e-9
         if dt > max_gap:
+            # Nothing is integrated across a gap.
             flag |= GAP
+            turned, speed2 = gap_variance(state[RATE:RATE + 3], dt)
+            for i in range(3):
+                cov[i, i] += turned
+                cov[3 + i, 3 + i] += speed2
+            state[COUNT] = 0.0
+            dt = 0.0
+        first = state[COUNT] == 0.0
         residual = math.nan
         if determined:
             fit = np.zeros(12)
@@ -202,7 +210,6 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
         state[ALPHA:ALPHA + 3] = alpha
         state[RATE:RATE + 3] = omega
         state[ACC:ACC + 3] = acc
-        state[GRADIENT:GRADIENT + 9] = gradient.copy().reshape(9)
         state[STEP] = dt
         state[COUNT] += 1.0
         last[0] = stamp[n]

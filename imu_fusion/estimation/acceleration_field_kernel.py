@@ -172,6 +172,32 @@ def predict(x, cov, quat, dt, step, noise, jerk_density, acc_density, bias_walk)
 
 
 @njit(cache=True)
+def gap_variance(omega, dt):
+    """Variances (attitude, omega) that a gap adds: the body may have stopped or turned twice as
+    fast, and turned to anywhere."""
+    speed2 = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
+    return min(speed2 * dt * dt, math.pi * math.pi), speed2
+
+
+@njit(cache=True)
+def reopen(x, cov, dt, spread):
+    """After a gap: omega and attitude are held, wider by :func:`gap_variance`; accelerations and
+    their rates are as unknown as at the start, with standard deviations ``spread`` (4,) of
+    alpha, its rate, a and its rate; biases stay. In place."""
+    turned, speed2 = gap_variance(x[3:6], dt)
+    kept = cov[3:6, 3:6].copy()
+    cov[3:18, :] = 0.0
+    cov[:, 3:18] = 0.0
+    cov[3:6, 3:6] = kept
+    for i in range(3):
+        cov[i, i] += turned
+        cov[3 + i, 3 + i] += speed2
+        for k in range(4):
+            x[6 + 3 * k + i] = 0.0
+            cov[6 + 3 * k + i, 6 + 3 * k + i] = spread[k] * spread[k]
+
+
+@njit(cache=True)
 def channel_row(is_gyro, u, r, c, omega, index, h):
     """Indices and values of the row of channel c, linearised at omega.
 
@@ -262,14 +288,15 @@ def update(x, cov, reading, is_gyro, direction, lever, variance, ranges, at, tra
 
 @njit(cache=True)
 def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, variance, ranges,
-            bias_walk, jerk_density, motion_rate, acc_density, max_gap, at, fixed_at, reference, gravity,
-            specific_force, values, flags, trace):
+            bias_walk, jerk_density, motion_rate, acc_density, max_gap, spread, at, fixed_at,
+            reference, gravity, specific_force, values, flags, trace):
     """Filter n samples in order, in place; one row of values (n, 71) and flags (n,) each.
 
     last: (1,) int64 stamp of the previous sample, negative before the first. at: (n, 3)
-    angular velocities to linearise at if ``fixed_at``, else each prediction is used. trace: a
-    tuple of arrays (x, cov, phi, dt, columns, totals, innovations, rows) of n samples, or of
-    one sample when it is not wanted (then values are written instead).
+    angular velocities to linearise at if ``fixed_at``, else each prediction is used. spread: see
+    :func:`reopen`. trace: a tuple of arrays (x, cov, phi, dt, columns, totals, innovations,
+    rows) of n samples, or of one sample when it is not wanted (then values are written
+    instead); dt is negative across a gap.
 
     Returns the log likelihood of the readings.
     """
@@ -284,14 +311,18 @@ def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, vari
         dts[k] = 0.0
         if last[0] >= 0:
             dt = (stamp[n] - last[0]) * 1e-9
-            if dt != stepped:
-                step, noise = motion_step(dt, motion_rate)
-                stepped = dt
-            phis[k] = predict(x, cov, quat, dt, step, noise, jerk_density, acc_density,
-                              bias_walk)
-            dts[k] = dt
             if dt > max_gap:
                 flag |= GAP
+                reopen(x, cov, dt, spread)
+                phis[k] = 0.0
+                dts[k] = -dt
+            else:
+                if dt != stepped:
+                    step, noise = motion_step(dt, motion_rate)
+                    stepped = dt
+                phis[k] = predict(x, cov, quat, dt, step, noise, jerk_density, acc_density,
+                                  bias_walk)
+                dts[k] = dt
         last[0] = stamp[n]
         where = at[n].copy() if fixed_at else x[3:6].copy()
         squares, log_likelihood, used, seen = update(
@@ -318,7 +349,8 @@ def forward(x, cov, quat, last, stamp, readings, is_gyro, direction, lever, vari
 
 
 @njit(cache=True)
-def backward(adjoint, information, trace, motion_rate, is_gyro, direction, lever, smoothed, smoothed_cov):
+def backward(adjoint, information, trace, motion_rate, is_gyro, direction, lever, smoothed,
+             smoothed_cov):
     """Modified Bryson-Frazier smoother over the n samples of a trace (Bierman 1977), in place.
 
     adjoint (n_x, 1) and information (n_x, n_x) carry on from the samples after these and end
@@ -357,6 +389,11 @@ def backward(adjoint, information, trace, motion_rate, is_gyro, direction, lever
             for k in range(count):
                 for l in range(count):
                     information[index[k], index[l]] += row[k] * row[l] * quadratic
+        if dts[n] < 0.0:
+            # Across a gap, only attitude, omega and biases are the same state.
+            adjoint[6:18] = 0.0
+            information[6:18, :] = 0.0
+            information[:, 6:18] = 0.0
         if dts[n] > 0.0:
             step, _ = motion_step(dts[n], motion_rate)
             turn, jac = transition(phis[n])

@@ -13,6 +13,7 @@ from imu_fusion.estimation.acceleration_field_kernel import (TOUCHED, backward, 
                                                              forward)
 from imu_fusion.estimation.acceleration_field_rows import (GAP, MISSING, SATURATED, VALUES,
                                                            put_row, rigid_gradient)
+from imu_fusion.estimation.acceleration_field_start import motion_spread
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 
 # Samples whose covariances the smoother keeps at a time; others are filtered again when needed.
@@ -39,6 +40,7 @@ class RigidBodyFilter:
         self._layout = layout
         self.state = {"x": x.copy(), "cov": cov.copy(), "quat": quat.copy(),
                       "last": np.array([-1], dtype=np.int64)}
+        self._spread = motion_spread(params)
         self._one = _trace(1, len(x), len(layout.density))
 
     def process(self, stamp, readings):
@@ -54,8 +56,8 @@ class RigidBodyFilter:
         return forward(s["x"], s["cov"], s["quat"], s["last"], stamp, readings, l.is_gyro,
                        l.direction, l.lever, noise_variance(p, l), l.range,
                        l.bias_walk, p.motion__jerk_density, p.motion__rate,
-                       p.motion__acceleration_rate_density, p.max_gap, at, fixed_at, l.reference, p.gravity, l.specific_force,
-                       values, flags, trace)
+                       p.motion__acceleration_rate_density, p.max_gap, self._spread, at, fixed_at,
+                       l.reference, p.gravity, l.specific_force, values, flags, trace)
 
 
 _NO_VALUES, _NO_FLAGS = np.empty((0, VALUES)), np.empty(0, dtype=np.uint32)
@@ -124,11 +126,12 @@ def _put_smoothed(stamp, readings, mean, cov, quat, is_gyro, direction, lever, v
         if n > 0:
             dt = (stamp[n] - stamp[n - 1]) * 1e-9
             w0, w1 = mean[n - 1, 3:6], mean[n, 3:6]
-            phi = (0.5 * dt * (w0 + w1)
-                   + dt * dt / 12.0 * (mean[n - 1, 6:9] - mean[n, 6:9] + np.cross(w0, w1)))
-            quat = quat_normalize(quat_multiply(quat, quat_exp(phi)))
             if dt > max_gap:
                 flags[n] |= GAP
+            else:
+                phi = (0.5 * dt * (w0 + w1)
+                       + dt * dt / 12.0 * (mean[n - 1, 6:9] - mean[n, 6:9] + np.cross(w0, w1)))
+                quat = quat_normalize(quat_multiply(quat, quat_exp(phi)))
         squares, used = 0.0, 0
         for c in range(len(variance)):
             if np.isnan(readings[n, c]):

@@ -31,7 +31,13 @@ ROW = np.dtype([
     ("residual_rms", "f8"),              # of what the model does not explain, in units of noise
     ("flags", "u4"),
 ])
-VALUES = 71  # float columns between stamp and flags
+# Which of the float columns between stamp and flags each field takes.
+_COLUMNS = {}
+VALUES = 0
+for _name in ROW.names[1:-1]:
+    _width = int(np.prod(ROW[_name].shape))
+    _COLUMNS[_name] = slice(VALUES, VALUES + _width), ROW[_name].shape
+    VALUES += _width
 
 
 @njit(cache=True)
@@ -95,12 +101,8 @@ def make_rows(stamp, values, flags):
     rows = np.empty(len(stamp), ROW)
     rows["stamp"] = stamp
     rows["flags"] = flags
-    column = 0
-    for name in ROW.names[1:-1]:
-        shape = ROW[name].shape
-        width = int(np.prod(shape))
-        rows[name] = values[:, column:column + width].reshape(len(stamp), *shape)
-        column += width
+    for name, (columns, shape) in _COLUMNS.items():
+        rows[name] = values[:, columns].reshape(-1, *shape)
     return rows
 
 

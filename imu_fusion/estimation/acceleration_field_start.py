@@ -21,14 +21,19 @@ def given_start(params, layout):
     m = len(layout.density)
     x = np.zeros(BIAS + m)
     x[OMEGA:OMEGA + 3] = params.initial__angular_velocity
-    # The processes of the model have run for a second: wide, and free of a tuned scale.
-    _, noise = motion_step(1.0, params.motion__rate)
-    jerk, acc = params.motion__jerk_density, params.motion__acceleration_rate_density
     sd = np.concatenate([
         np.full(3, params.initial__orientation_sd), np.full(3, params.initial__angular_velocity_sd),
-        np.full(3, jerk * np.sqrt(noise[2, 2])), np.full(3, jerk * np.sqrt(noise[3, 3])),
-        np.full(3, acc + 10 * params.gravity), np.full(3, acc), layout.bias_sd])
+        np.repeat(motion_spread(params), 3), layout.bias_sd])
     return x, np.diag(sd ** 2), normalized(params.initial__orientation)
+
+
+def motion_spread(params):
+    """Standard deviations (4,) of alpha, its rate, a and its rate where nothing is known of them:
+    the processes of the model have run for a second. Wide, and free of a scale of its own."""
+    _, noise = motion_step(1.0, params.motion__rate)
+    jerk, acc = params.motion__jerk_density, params.motion__acceleration_rate_density
+    return np.array([jerk * np.sqrt(noise[2, 2]), jerk * np.sqrt(noise[3, 3]),
+                     acc + 10 * params.gravity, acc])
 
 
 def rest_start(params, layout, readings):

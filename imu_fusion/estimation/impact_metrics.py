@@ -180,7 +180,8 @@ def find_events(t, magnitude, params):
     for k in crossings:
         if t[k] <= end:
             continue
-        begin, end = t[k] - params.impact__before, t[k] - params.impact__before + params.impact__duration
+        begin = t[k] - params.impact__before
+        end = begin + params.impact__duration
         events.append(slice(int(np.searchsorted(t, begin)),
                             int(np.searchsorted(t, end, side="right"))))
     return events
@@ -219,7 +220,8 @@ def measure_impacts(rows, points, gravity, params=ImpactParams()):
     if params.impact__linear_class is not None:
         acc = channel_filter(acc, 1 / step, params.impact__linear_class)
     if params.impact__angular_class is not None:
-        omega, alpha = (channel_filter(v, 1 / step, params.impact__angular_class) for v in (omega, alpha))
+        omega, alpha = (channel_filter(v, 1 / step, params.impact__angular_class)
+                        for v in (omega, alpha))
     results = []
     for number, event in enumerate(events):
         # Holes give no honest metric.
@@ -232,7 +234,8 @@ def measure_impacts(rows, points, gravity, params=ImpactParams()):
                     rows["stamp"][event][0]), "point": [float(v) for v in point],
                 **({"refused": refused} if refused else
                    _metrics(t[event], acc[event, k], omega[event], alpha[event])),
-                "linear_class": params.impact__linear_class, "angular_class": params.impact__angular_class,
+                "linear_class": params.impact__linear_class,
+                "angular_class": params.impact__angular_class,
                 "complete": bool(t[-1] - t[event][0] >= params.impact__duration - 1.5 * step),
                 "saturated_samples": int(np.sum(rows["flags"][event] & SATURATED > 0)),
                 "missing_samples": int(np.sum(rows["flags"][event] & (MISSING | GAP) > 0)),

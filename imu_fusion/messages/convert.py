@@ -8,6 +8,7 @@ about the fixed axes of the world, as geometry_msgs/PoseWithCovariance words it;
 estimators keep it about the axes of the sensor.
 """
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -99,6 +100,18 @@ def bool_message(value):
 def bool_value(cdr):
     """The value of a CDR std_msgs/Bool."""
     return cdr[4] == 1
+
+
+def string_message(text):
+    """CDR bytes of a std_msgs/String."""
+    data = text.encode() + b"\0"
+    return b"\x00\x01\x00\x00" + struct.pack("<I", len(data)) + data
+
+
+def string_value(cdr):
+    """The text of a CDR std_msgs/String."""
+    (length,) = struct.unpack_from("<I" if cdr[1] else ">I", cdr, 4)
+    return bytes(cdr[8:8 + length - 1]).decode()
 
 
 def imu_values(values):

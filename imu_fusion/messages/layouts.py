@@ -158,7 +158,8 @@ VECTOR3 = Layout("geometry_msgs/msg/Vector3Stamped", vector=3)
 ODOMETRY = Layout("nav_msgs/msg/Odometry", child=True, position=3, orientation=4,
                   pose_covariance=36, linear=3, angular=3, twist_covariance=36)
 
-BOOL_TYPE = "std_msgs/msg/Bool"  # no header, no layout: see convert.bool_message
+# No headers, no layouts: see convert.bool_message and string_message.
+BOOL_TYPE, STRING_TYPE = "std_msgs/msg/Bool", "std_msgs/msg/String"
 
 LAYOUTS = {layout.msgtype: layout
            for layout in (IMU, MAG, FIX, TWIST, POSE, ACCEL, VECTOR3, ODOMETRY)}

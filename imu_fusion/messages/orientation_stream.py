@@ -108,6 +108,15 @@ def turn_to_true_north(params, stamp, sample):
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
+def warm_up(params):
+    """Compile, or load from the cache, what the first samples would otherwise wait for."""
+    estimator = OrientationEstimator(params.replace(alignment_duration=0.05))
+    for i in range(20):
+        stamp = i * 10_000_000
+        estimator.add_mag(stamp, np.array([0.0, 2e-5, -4e-5]))
+        estimator.add_imu(stamp, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+
+
 class OrientationStream(Stream):
     """See :class:`imu_fusion.messages.streams.Stream`.
 

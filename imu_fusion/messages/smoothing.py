@@ -48,8 +48,8 @@ class SmootherNodeParams(Parameters):
     """What concerns the node, not the trajectory."""
 
     qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
-                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
-                         "for repeats of what was lost (replay).")
+                     doc="Live subscriptions: sensor_data takes any publisher; reliable asks for "
+                         "repeats of what was lost. In a replay they are always reliable.")
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
                                     "taken, and smoothing is refused until smoother/clear.")

@@ -20,8 +20,8 @@ class EstimatorNodeParams(Parameters):
     """What concerns a node, not its estimate."""
 
     qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
-                     doc="Subscriptions: sensor_data takes any publisher (live); reliable asks "
-                         "for repeats of what was lost (replay).")
+                     doc="Live subscriptions: sensor_data takes any publisher; reliable asks for "
+                         "repeats of what was lost. In a replay they are always reliable.")
 
 
 _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at

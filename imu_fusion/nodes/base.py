@@ -1,8 +1,10 @@
 """What all nodes share: parameters from dataclasses, diagnostics, start and orderly end."""
 
 import importlib
+import os
 import signal
 import sys
+from pathlib import Path
 
 import rclpy
 import rclpy.node
@@ -13,6 +15,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from imu_fusion import parameter_file
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
 from imu_fusion.nodes.flow import steady_timer
 
@@ -65,17 +68,21 @@ class Node(rclpy.node.Node):
     Class attributes: ``NAME`` and ``PARAMETERS``, a tuple of Parameters dataclasses, and
     ``OPEN_PREFIXES``: parameters below these need not be known, ``open_parameters`` holds them.
     Other unknown parameters, wrong types and values out of bounds raise ParameterError.
+
+    Args:
+        params_files: the parameter files that rclpy was given: relative file names in them
+            are relative to them.
     """
 
     NAME = ""
     PARAMETERS = ()
     OPEN_PREFIXES = ()
 
-    def __init__(self, **kwargs):
+    def __init__(self, params_files=(), **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
                          **kwargs)
         self.finished = False
-        self._params = self._declare()
+        self._params = self._declare(params_files)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._diagnostics = None
 
@@ -108,7 +115,7 @@ class Node(rclpy.node.Node):
 
         steady_timer(self, 1.0, publish)
 
-    def _declare(self):
+    def _declare(self, params_files):
         # rclpy has declared what was given, with the type that it was given in. Take it
         # back, and declare everything in the type of the dataclass.
         given = {}
@@ -126,6 +133,7 @@ class Node(rclpy.node.Node):
         if unknown:
             raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
                                  f"known: {', '.join(sorted(known))}")
+        parameter_file.resolve_paths(given, self.PARAMETERS, self.get_name(), params_files)
         values = {}
         for cls in self.PARAMETERS:
             own = {}
@@ -190,8 +198,10 @@ def run_node(node_class, args=None):
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
+        use_fast_heartbeats()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        _run(node_class, signals)
+        files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
+        _run(node_class, signals, files)
         return 0
     except ImuFusionError as error:
         return _complain(node_class, error)
@@ -205,8 +215,15 @@ def run_node(node_class, args=None):
             signal.signal(number, handler)
 
 
-def _run(node_class, signals):
-    node = node_class()
+def use_fast_heartbeats():
+    """Let Fast DDS notice lost messages soon, unless the user has profiles of their own."""
+    if not {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"} & os.environ.keys():
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(
+            Path(__file__).parent / "flow" / "fastdds.xml")
+
+
+def _run(node_class, signals, params_files):
+    node = node_class(params_files=params_files)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     stopping = False

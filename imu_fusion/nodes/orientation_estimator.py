@@ -8,7 +8,7 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages.orientation_stream import (OUTPUTS, OrientationOutputParams,
-                                                    OrientationStream)
+                                                    OrientationStream, warm_up)
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
@@ -26,6 +26,7 @@ class OrientationEstimatorNode(EstimatorNode):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
+        warm_up(self.params(OrientationParams))
         self.attach(OrientationStream(
             self.params(OrientationParams), self.params(OrientationOutputParams), self.emit,
             self.get_logger().warning), OUTPUTS)

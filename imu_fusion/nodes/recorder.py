@@ -30,6 +30,8 @@ class RecorderParams(Parameters):
     overwrite: bool = param(False, doc="replace a recording that is there already")
     end_with_sources: bool = param(
         True, doc="close when all sources of recorded topics have said that they ended")
+    expected_sources: tuple[str, ...] = param(
+        (), doc="names of nodes that may begin later: do not close before they have ended, too")
 
 
 def offered(info):
@@ -70,6 +72,7 @@ class Recorder(Node):
         self._regex = _compile("regex", p.regex) if p.regex is not None else None
         self._excluded = [_compile("exclude", pattern) for pattern in p.exclude]
         self._skipped = set()
+        self._expected = {f"/{name.lstrip('/')}" for name in p.expected_sources}
         self._sim_time = self.get_parameter("use_sim_time").value
         self._writer = BagWriter(p.out, compression=p.compression, chunk_size=p.chunk_size,
                                  overwrite=p.overwrite)
@@ -110,7 +113,10 @@ class Recorder(Node):
             self._subscribe(topic, [msgtype])
 
     def _on_end(self, session):
-        if session.event != NEXT and not self._flow.feeding() and self._p.end_with_sources:
+        if session.event == NEXT:
+            return
+        self._expected.discard(session.source)
+        if self._p.end_with_sources and not self._expected and not self._flow.feeding():
             self.finished = True
 
     def _discover(self):

@@ -1,4 +1,4 @@
-"""The report of a recording: what it holds, and how good the orientation made from it is."""
+"""The report of a recording: what it holds, and how good what is made from it is."""
 
 import datetime
 from dataclasses import dataclass
@@ -7,20 +7,27 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import TopicError
+from imu_fusion.batch import StageReport, stages
+from imu_fusion.errors import EstimationError, SampleError, TopicError
 from imu_fusion.estimation.orientation_error import moving_at, orientation_errors
+from imu_fusion.messages import smoothing
 from imu_fusion.messages.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
+from imu_fusion.parameter_file import parameters_for
+from imu_fusion.report.acceleration_field import field_sections
+from imu_fusion.report.field_data import read_field
 from imu_fusion.report.figures import intervals
 from imu_fusion.report.gnss import gnss_section
-from imu_fusion.report.html import Notes, Section, Text, write_report
+from imu_fusion.report.html import Notes, Numbers, Section, Text, write_report
 from imu_fusion.report.orientation import (
     error_section, field_section, key_numbers, motion_section, orientation_section)
 from imu_fusion.report.overview import overview_section
+from imu_fusion.report.smoother import Smoothed, smoother_numbers, smoother_sections
 from imu_fusion.samples import seconds
 from imu_fusion.samples.guard import guard_log
+from imu_fusion.surface_file import load_surface
 
 RAW, MAGNETOMETER, ESTIMATES = "imu/data_raw", "imu/mag", "imu/data"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
@@ -42,6 +49,11 @@ class Contents:
     def log(self, topic):
         """The log of a topic, or None."""
         return self.logs.get(topic)
+
+    def samples(self, topics):
+        """dict of topic to (log, epochs), as the stages of batch take it."""
+        return {topic: (self.logs[topic], np.zeros(len(self.logs[topic]), np.int64))
+                for topic in topics if topic in self.logs and len(self.logs[topic])}
 
 
 def read_contents(path):
@@ -76,22 +88,61 @@ def read_estimates(path):
         return _usable(read_log(reader, ESTIMATES, attitude_log), ESTIMATES, warnings), warnings
 
 
-def write_orientation_report(bag, estimates, path):
-    """Write the HTML report of a recording.
+def estimate_orientation(contents, params_file=None):
+    """AttitudeLog of the orientation estimator, from the recording's own samples; None if it
+    has no imu/data_raw."""
+    if RAW not in contents.logs:
+        return None
+    stage, params = stages()["orientation_estimator"].prepare(params_file)
+    messages = stage.run(contents.samples(stage.required | stage.optional),
+                         StageReport(stage.node, params), *params)
+    return attitude_log([cdr for topic, _, cdr in messages if topic == ESTIMATES])
+
+
+def smooth_recording(contents, params_file=None):
+    """The smoothed trajectory of a recording.
+
+    Returns:
+        (Smoothed, None), or (None, why not in words); (None, None) without Imu or fixes.
+    """
+    if not set(smoothing.REQUIRED) <= contents.logs.keys():
+        return None, None
+    params, _ = parameters_for([smoothing.SmoothingParams, smoothing.SmootherNodeParams],
+                               "smoother", params_file)
+    try:
+        result = smoothing.smooth(params, contents.samples(smoothing.INPUTS))
+    except (EstimationError, SampleError) as error:
+        return None, f"There is no smoothed trajectory: {error}"
+    surface = load_surface(params.surface) if params.surface else None
+    return Smoothed(result, params, surface, contents.log(FIX_TOPIC), contents.log(VELOCITY_TOPIC),
+                    int(contents.log(RAW).stamp[0])), None
+
+
+def write_recording_report(bag, estimates, path, params_file=None):
+    """Write the HTML report of a recording; its trajectory is smoothed anew for it.
 
     Args:
         bag: recording with sensor topics and perhaps ``reference/pose``; another PoseStamped
             topic is used in its place if there is no such topic.
-        estimates: recording with ``imu/data``, may be the same; if it has none, the report is
-            about the recording alone.
+        estimates: recording with ``imu/data``, may be the same; if it has none, the report says
+            so. None: those in ``bag``, or else made from it. ``acceleration_field/*`` in it
+            get their sections, too.
         path: HTML file to write.
+        params_file: ROS 2 parameter file of the estimators, or None for defaults.
+
+    Returns:
+        Smoothed, or None if there is nothing to smooth.
 
     Raises:
         BagError, TopicError: a recording cannot be read, or holds nothing to report about.
-        ImuFusionError: the file cannot be written.
+        ImuFusionError: parameters are not usable, or the file cannot be written.
     """
     contents = read_contents(bag)
-    estimate, warnings = read_estimates(estimates)
+    source = bag if estimates is None else estimates
+    estimate, warnings = read_estimates(source)
+    if estimate is None and estimates is None:
+        estimate, estimates = estimate_orientation(contents, params_file), "this report's own run"
+    smoothed, reason = smooth_recording(contents, params_file)
     warnings = [*contents.warnings, *warnings]
     raw, mag = contents.log(RAW), contents.log(MAGNETOMETER)
     reference = contents.log(contents.reference_name)
@@ -112,11 +163,17 @@ def write_orientation_report(bag, estimates, path):
 
     rate = next((t.rate for t in contents.topics if t.topic.lstrip("/") == RAW), None)
     findings = sum(len(t.findings) for t in contents.topics) + len(warnings)
-    blocks = [key_numbers(contents.duration_s, np.nan if rate is None else rate, errors, moving,
-                          findings, is_truth)]
+    rate = np.nan if rate is None else rate
+    if smoothed is None:
+        numbers = key_numbers(contents.duration_s, rate, errors, moving, findings, is_truth)
+    else:  # the orientation alone is no longer what counts most
+        numbers = key_numbers(contents.duration_s, rate, findings=findings)
+        numbers = Numbers((*smoother_numbers(smoothed.result), *numbers.items))
+    blocks = [numbers]
     if warnings:
         blocks.append(Notes(tuple(warnings)))
-    if estimate is None:
+    field = read_field(bag, source, params_file)
+    if estimate is None and field is None:
         blocks.append(Text(f"{Path(estimates).name} holds no estimates on {ESTIMATES}: this "
                            "report is about the recording alone. imu_fusion process makes them."))
     elif errors is not None:
@@ -124,13 +181,21 @@ def write_orientation_report(bag, estimates, path):
                            "the recording" + ("." if is_truth else ", which is somebody's "
                                               "estimate too: what follows are differences, not "
                                               "errors.")))
+    if reason is not None:
+        blocks.append(Text(reason))
     sections = [Section("Summary", tuple(blocks)), overview_section(contents.topics, origin)]
+    if smoothed is not None:
+        # Positions of the reference count from the origin of the surface.
+        in_world = is_truth and smoothed.surface is not None and np.any(reference.position_world)
+        sections += smoother_sections(smoothed, reference if in_world else None)
     if estimate is not None:
         sections.append(orientation_section(estimate, origin, reference,
                                             contents.reference_name or "", shaded))
     if errors is not None:
         sections.append(error_section(errors, origin, moving, contents.reference_name, is_truth,
                                       shaded))
+    if field is not None:
+        sections += field_sections(field, origin)
     if estimate is not None and mag is not None:
         sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
     if raw is not None or estimate is not None:
@@ -141,6 +206,7 @@ def write_orientation_report(bag, estimates, path):
     date = datetime.datetime.fromtimestamp(contents.start * 1e-9, datetime.timezone.utc)
     write_report(path, Path(bag).resolve().name, sections,
                  f"{bag}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
+    return smoothed
 
 
 def carry(mag, estimate):

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 from scipy.signal import lfilter
 
 from imu_fusion.errors import SampleError

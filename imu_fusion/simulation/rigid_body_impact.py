@@ -18,8 +18,8 @@ from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.geometry.rotation import (quat_exp, quat_from_matrix, quat_multiply,
-                                          quat_normalize, quat_rotate, quat_rotate_inverse)
+from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize,
+                                          quat_rotate, quat_rotate_inverse)
 
 # Ratio of curvatures below which an ellipsoid is a blade: outside the table of the contact law.
 _SMALLEST_RATIO = 1e-3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_fusion.estimation.smoother import kernel, model
+from imu_fusion.estimation.smoother import kernel, model, transition
 
 LAYOUT, SIZE = model.make_layout([name for name, _ in model.BLOCKS])
 SPIN = np.array([0.0, 5e-5, 5e-5])
@@ -29,7 +29,7 @@ def perturbed(x, i, step):
     delta = np.zeros(SIZE)
     delta[i] = step
     y = x.copy()
-    kernel.boxplus(y, delta)
+    transition.boxplus(y, delta)
     return y
 
 
@@ -37,12 +37,12 @@ COLUMNS = np.array([*range(6, 15), *range(LAYOUT[model.ACC_MATRIX], LAYOUT[model
                     *range(LAYOUT[model.GYR_SCALE], LAYOUT[model.GYR_SCALE] + 3)])
 
 
-def transition(x, gyr, acc, dt, decay):
+def transition_matrix(x, gyr, acc, dt, decay):
     _, f_vel, f_att, *_ = carry(x, gyr, acc, dt, decay)
     out = np.empty((SIZE, SIZE))
-    kernel._propagate_rows(np.eye(SIZE), out, dt, decay, f_vel, f_att, COLUMNS)
+    transition.propagate_rows(np.eye(SIZE), out, dt, decay, f_vel, f_att, COLUMNS)
     adjoint = np.empty((SIZE, SIZE))
-    kernel._adjoint_rows(np.eye(SIZE), adjoint, dt, decay, f_vel, f_att, COLUMNS)
+    transition.adjoint_rows(np.eye(SIZE), adjoint, dt, decay, f_vel, f_att, COLUMNS)
     # The two accumulate in different orders.
     assert np.allclose(adjoint, out.T, rtol=0, atol=1e-12)
     return out
@@ -53,11 +53,11 @@ def test_transition_matches_differences():
     x, gyr, acc = random_state(rng), rng.standard_normal(3), 10 * rng.standard_normal(3)
     dt, decay = 0.02, np.ones(SIZE)
     decay[LAYOUT[model.GNSS_ERROR]:LAYOUT[model.GNSS_ERROR] + 3] = 0.9
-    f = transition(x, gyr, acc, dt, decay)
+    f = transition_matrix(x, gyr, acc, dt, decay)
     numeric, out = np.empty((SIZE, SIZE)), np.empty(SIZE)
     for i in range(SIZE):
         up, down = (carry(perturbed(x, i, s), gyr, acc, dt, decay)[0] for s in (1e-5, -1e-5))
-        kernel.boxminus(up, down, out)
+        transition.boxminus(up, down, out)
         numeric[:, i] = out / 2e-5
     # Left out on purpose: gravity's, Coriolis' and Earth rate's own derivatives (dt * 1e-4),
     # and the Jacobian of half a turn (dt^2 / 4 times rate and force).
@@ -123,7 +123,7 @@ def test_solver_agrees_with_dense_algebra():
     for k in range(count - 1):  # a trajectory with small gaps
         x[k + 1] = carry(x[k], inputs[k, :3], inputs[k, 3:], 0.02,
                          np.exp(-decay_rate * 0.02))[0]
-        kernel.boxplus(x[k + 1], 0.01 * rng.standard_normal(n))
+        transition.boxplus(x[k + 1], 0.01 * rng.standard_normal(n))
     field = np.array([1.0, 20.0, -43.0])
     motion = (dt, inputs, noise, gravity, SPIN, decay_rate, walk, LAYOUT, COLUMNS, field, lever)
     kinds = np.array([0, 1, 2, 0, 2])
@@ -144,9 +144,9 @@ def test_solver_agrees_with_dense_algebra():
     for k in range(count - 1):
         decay = np.exp(-decay_rate * 0.02)
         x_next, *_, = carry(x[k], inputs[k, :3], inputs[k, 3:], 0.02, decay)
-        f = transition(x[k], inputs[k, :3], inputs[k, 3:], 0.02, decay)
+        f = transition_matrix(x[k], inputs[k, :3], inputs[k, 3:], 0.02, decay)
         defect = np.empty(n)
-        kernel.boxminus(x_next, x[k + 1], defect)
+        transition.boxminus(x_next, x[k + 1], defect)
         g = np.zeros((n, width))
         at = n + k * (6 + n - 9)
         _, f_vel, *_ = carry(x[k], inputs[k, :3], inputs[k, 3:], 0.02, decay)
@@ -197,7 +197,7 @@ def test_solver_agrees_with_dense_algebra():
         np.zeros((5, 3)), True, cov_out, var_out)
     for k in range(count):
         target = x[k].copy()
-        kernel.boxplus(target, expected[k])
+        transition.boxplus(target, expected[k])
         assert np.allclose(moved[k], target, rtol=0, atol=1e-9), k
         full = maps[k] @ posterior @ maps[k].T
         for block in range(3):
@@ -230,11 +230,11 @@ def test_segments_change_nothing(monkeypatch):
                         np.zeros((len(m), 3)), False, np.empty((0, 3, 3, 3)),
                         np.empty((0, n - 9)))
     # One segment as long as the whole.
-    storage = kernel._storage(count, 3 * len(m), n)
+    storage = kernel.make_storage(count, 3 * len(m), n)
     delta, cov, step = np.zeros(n), np.eye(n), np.empty((count, n))
     kernel.filter_segment(0, count, False, x, delta, cov, motion, measured, rows,
-                          np.zeros((len(m), 3)), True, storage)
+                          np.zeros((len(m), 3)), storage)
     kernel.smooth_segment(0, count, x, np.zeros(n), np.zeros((n, n)), motion, storage, False,
                           step, np.empty((0, 3, 3, 3)), np.empty((0, n - 9)))
-    kernel.apply_step(x, step, np.zeros(3))
+    transition.apply_step(x, step, np.zeros(3))
     assert np.array_equal(moved, x)

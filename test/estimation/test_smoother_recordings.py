@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks import smoother_drive, smoother_flight
-from imu_fusion.estimation.smoother import Smoother
+from benchmarks.data import data_path
+from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
+from imu_fusion.simulation.jump_sensors import EPOCH
 
 pytestmark = pytest.mark.slow
 
@@ -46,3 +49,29 @@ def test_flight_innovations():
         assert np.all((rms > 0.4) & (rms < 1.3)), name
     # GNSS of an autopilot of 2013: some 0.2 s late.
     assert 0.15 < result.states["gnss_time_offset"][0][0, 0] < 0.35
+
+
+def test_indoor_walk_admits_what_its_position_is_worth():
+    """Fixes of 22 to 670 m accuracy, no velocities; indoors, such errors wander."""
+    folder = data_path("phone_walk")
+    if not folder.exists():
+        pytest.skip("phone_walk is not at hand: set IMU_FUSION_DATA")
+    columns = {name: np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1)
+               for name in ("Accelerometer", "Gyroscope", "Magnetometer", "Location")}
+    stamp = {k: EPOCH + np.round(v[:, 0] * 1e9).astype(np.int64) for k, v in columns.items()}
+    gyr = np.stack([np.interp(columns["Accelerometer"][:, 0], columns["Gyroscope"][:, 0], c)
+                    for c in columns["Gyroscope"][:, 1:].T], axis=1)
+    place = columns["Location"]
+    cov = np.eye(3) * place[:, 6, None, None] ** 2
+    params = SmootherParams(gnss_position_error_sd=(22.0, 22.0, 22.0),
+                            gnss_position_error_tau=60.0)
+    result = Smoother(params).run(
+        ImuLog(stamp["Accelerometer"], gyr=gyr, acc=columns["Accelerometer"][:, 1:]),
+        MagLog(stamp["Magnetometer"], columns["Magnetometer"][:, 1:] * 1e-6),
+        FixLog(stamp["Location"], place[:, 1], place[:, 2], place[:, 3], cov,
+               np.zeros(len(place))))
+    sd = np.sqrt(result.samples["cov_position"][:, 0, 0])
+    # Wandering errors do not average out: the best stretch is worth about the best fix.
+    assert 15.0 < sd.min() < 40.0
+    # Tilt needs no position: gravity tells it to a few degrees.
+    assert np.degrees(np.sqrt(np.median(result.samples["cov_attitude"][:, 0, 0]))) < 5.0

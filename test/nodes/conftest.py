@@ -10,6 +10,7 @@ from sensor_msgs.msg import Imu
 
 from imu_fusion.messages.bag import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.nodes.base import use_fast_heartbeats
 from imu_fusion.nodes.flow import FlowSink
 
 START = 1_700_000_000_000_000_000
@@ -46,7 +47,7 @@ class Graph:
         self.nodes.remove(node)
         node.destroy_node()
 
-    def until(self, condition, timeout=30.0):
+    def until(self, condition, timeout=180.0):  # the first run compiles kernels
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, "the event did not happen"
@@ -65,6 +66,7 @@ class Graph:
 
 @pytest.fixture
 def graph():
+    use_fast_heartbeats()
     rclpy.init()
     graph = Graph()
     yield graph

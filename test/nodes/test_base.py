@@ -8,7 +8,7 @@ from rclpy.exceptions import ParameterUninitializedException
 from rclpy.parameter import Parameter
 
 from imu_fusion.errors import ParameterError, TopicError
-from imu_fusion.nodes.base import Node, message_class
+from imu_fusion.nodes.base import Node, message_class, run_node
 from imu_fusion.parameters import Parameters, param
 
 
@@ -122,3 +122,37 @@ def test_message_types_by_name():
     for name in ("sensor_msgs/msg/Nothing", "nowhere_msgs/msg/Imu", "Imu"):
         with pytest.raises(TopicError, match=f"message type {name} is not installed"):
             message_class(name)
+
+
+@dataclass(frozen=True)
+class Places(Parameters):
+    here: str = param("", doc="a file", path=True)
+    there: str = param("", doc="another file", path=True)
+
+
+class Reader(Node):
+    """Reads files."""
+
+    NAME = "reader"
+    PARAMETERS = (Places,)
+    seen = []
+
+    def work(self):
+        self.seen.append(self.params(Places))
+        self.finished = True
+        return 0.0
+
+
+def test_files_named_in_a_parameter_file_are_relative_to_it(tmp_path):
+    """Those named on the command line, or without a file of that name beside it, are not."""
+    (tmp_path / "hill.yaml").write_text("type: plane")
+    first, last = tmp_path / "first.yaml", tmp_path / "last.yaml"
+    first.write_text("/ns/reader: {ros__parameters: {here: hill.yaml, there: hill.yaml}}")
+    last.write_text("/**: {ros__parameters: {there: zakopane_hs140}}")
+    arguments = ["--ros-args", "-r", "__ns:=/ns", "--params-file", str(first)]
+    assert run_node(Reader, arguments) == 0
+    assert Reader.seen.pop() == Places(str(tmp_path / "hill.yaml"), str(tmp_path / "hill.yaml"))
+    assert run_node(Reader, [*arguments, "--params-file", str(last)]) == 0
+    assert Reader.seen.pop() == Places(str(tmp_path / "hill.yaml"), "zakopane_hs140")
+    assert run_node(Reader, [*arguments, "-p", "here:=elsewhere/hill.yaml"]) == 0
+    assert Reader.seen.pop() == Places("elsewhere/hill.yaml", str(tmp_path / "hill.yaml"))

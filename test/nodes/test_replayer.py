@@ -1,6 +1,7 @@
 """The replayer: what it plays, at which pace, to whom, and how it is controlled."""
 
 import pytest
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 from std_srvs.srv import Trigger
@@ -55,6 +56,16 @@ def test_pace_follows_log_time(graph, bag):
     assert len(times) == 100
     # never early; how late depends on the machine
     assert all(t - times[0] > i * STEP / 4 - 5e6 for i, t in enumerate(times))
+
+
+def test_rate_can_be_changed_while_playing(graph, bag):
+    """At a hundredth of the pace the 2 s would last 200 s."""
+    sink = collector(graph)
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.01)
+    graph.until(lambda: sink.messages[IMU])
+    assert replayer.set_parameters([Parameter("rate", value=0.0)])[0].successful
+    graph.until(lambda: replayer.finished)
+    assert sink.messages[IMU] == stored(bag, IMU)
 
 
 def test_start_offset_and_duration_select_by_log_time(graph, bag):

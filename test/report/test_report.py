@@ -19,7 +19,7 @@ from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import (
     Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
 from imu_fusion.report.orientation import euler_zyx
-from imu_fusion.report.recording import write_orientation_report
+from imu_fusion.report.recording import write_recording_report
 from imu_fusion.samples import FixLog, VelocityLog
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -74,7 +74,7 @@ def evil_recording(directory, topic):
 def test_strings_of_a_recording_cannot_become_markup(tmp_path):
     topic = f"/reference/{EVIL}"
     out = tmp_path / "report.html"
-    write_orientation_report(evil_recording(tmp_path / "b<i>ag", topic), tmp_path / "b<i>ag", out)
+    write_recording_report(evil_recording(tmp_path / "b<i>ag", topic), tmp_path / "b<i>ag", out)
     page = Page(out.read_text())
     assert not [tag for tag, attributes in page.tags if tag in ("img", "i", "iframe")]
     assert not [a for _, attributes in page.tags for a in attributes if a.startswith("on")]
@@ -113,14 +113,17 @@ def test_a_report_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_the_report_of_a_real_recording_is_complete_and_bounded(tmp_path):
-    """Without estimates it is about the recording."""
+    """Without orientation estimates it is about the recording and its trajectory."""
     out = tmp_path / "report.html"
-    write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    write_recording_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
     page = Page(out.read_text())
     assert "holds no estimates" in page.text and "/onboard_ekf/pose" in page.text
     assert "13656" in page.text and "136.55" in page.text and "214 gaps" in page.text
     headings = re.findall(r"<h2>(.*?)</h2>", out.read_text())
-    assert headings == ["Summary", "The recording", "Angular rates and specific force", "GNSS"]
+    assert headings == [
+        "Summary", "The recording", "Trajectory", "Velocity", "Attitude of the trajectory",
+        "Sensor errors", "Before and after", "Innovations", "Angular rates and specific force",
+        "GNSS"]
     assert out.stat().st_size < 8e6
 
 
@@ -202,7 +205,7 @@ def test_damaged_samples_are_left_out_and_told(tmp_path):
             writer.write("/reference/pose", "geometry_msgs/msg/PoseStamped",
                          pose_message(stamp, "world", quat), START + i * 10_000_000)
     out = tmp_path / "report.html"
-    write_orientation_report(tmp_path / "bag", tmp_path / "bag", out)
+    write_recording_report(tmp_path / "bag", tmp_path / "bag", out)
     text = Page(out.read_text()).text
     assert "reference/pose: 1 orientations are zero" in text
     assert "1 samples left out: repeated stamp" in text
@@ -213,7 +216,7 @@ def test_a_recording_without_messages_is_told(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/imu/data_raw", "sensor_msgs/msg/Imu")
     with pytest.raises(TopicError, match="no messages"):
-        write_orientation_report(tmp_path / "bag", tmp_path / "bag", tmp_path / "r.html")
+        write_recording_report(tmp_path / "bag", tmp_path / "bag", tmp_path / "r.html")
 
 
 def test_gnss_track_has_the_true_extent():
@@ -239,7 +242,7 @@ def test_a_real_browser_draws_every_figure_offline(tmp_path):
     if browser is None:
         pytest.skip("no Chromium here")
     out = tmp_path / "report.html"
-    write_orientation_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    write_recording_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
     drawn = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
          "--disable-background-networking", "--disable-component-update", "--disable-sync",

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.events import detect_jump, jump_result
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors
-from imu_fusion.estimation.smoother.inputs import prepare_imu
+from imu_fusion.estimation.smoother.inputs import prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.geometry.geodesy import hill_axes
 from imu_fusion.geometry.gravity import normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
@@ -76,7 +77,6 @@ class ExtendedRts:
         Raises:
             EstimationError: a sensor is missing or the filter diverged.
         """
-        from imu_fusion.estimation.smoother.smoother import SmootherResult, reference_frame
         if mag is None or velocity is None or not len(mag) or not len(velocity):
             raise EstimationError("method extended_rts needs a magnetometer and GNSS velocities")
         imu = prepare_imu(imu, self.params).log
@@ -243,7 +243,6 @@ class ExtendedRts:
 
     def _samples(self, imu, x, cov):
         """The paper's states in the conventions of this package."""
-        from imu_fusion.estimation.smoother.smoother import SAMPLE
         samples = np.empty(len(x), SAMPLE)
         samples["stamp"] = imu.stamp
         samples["position_world"] = x[:, _R] @ self.axes

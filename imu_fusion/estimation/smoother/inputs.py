@@ -7,9 +7,23 @@ import numpy as np
 
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
+from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import ImuLog
 
 _MICRO = 1e6  # magnetic states and rows are kept in microtesla, near one in size
+
+
+def reference_frame(surface, fix):
+    """The surface's frame, or one at the first valid fix."""
+    if surface is not None:
+        return surface.origin
+    valid = np.flatnonzero(fix.status >= 0) if fix is not None else ()
+    if not len(valid):
+        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
+                              "alone is the job of the orientation estimator")
+    i = valid[0]
+    return LocalFrame(float(fix.latitude_deg[i]), float(fix.longitude_deg[i]),
+                      float(fix.height[i]))
 
 
 @dataclass(frozen=True)

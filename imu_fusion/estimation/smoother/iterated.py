@@ -16,6 +16,7 @@ import numpy as np
 
 from imu_fusion.estimation.smoother import kernel, model
 from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.transition import boxminus
 
 
 
@@ -66,8 +67,10 @@ class Problem:
         """Extended Kalman filter over the first ``count`` samples; writes x."""
         self.x[0] = self.prior
         count = len(self.x) if count is None else count
-        cost = kernel.follow(self.x, count, np.diag(self.prior_sd ** 2), self.motion,
-                             self.attached, self.rows, self.innovation)
+        n = self.size
+        cost = kernel.filter_segment(
+            0, count, True, self.x, np.zeros(n), np.diag(self.prior_sd ** 2), self.motion,
+            self.attached, self.rows, self.innovation, kernel.make_storage(0, 0, n))
         # A heading is judged by what the filter did not expect, not by what it ended with.
         start = self.attached[0]
         squares = (self.innovation[:start[count]] ** 2).sum(axis=1)
@@ -103,7 +106,7 @@ class Problem:
             self.rows = evaluate_constraints(self.constraints, self.x[:, 0:3],
                                              self.imu.log.stamp, events, margin)
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
-        kernel.boxminus(self.prior, self.x[0], delta)
+        boxminus(self.prior, self.x[0], delta)
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
         covariances = np.empty((total if with_cov else 0, 3, 3, 3))
         variances = np.empty((total if with_cov else 0, n - 9))

@@ -19,7 +19,9 @@ from numba import njit
 from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE, FIX,
                                                   LEVER_ARM, POS, VEL, VELOCITY, interval,
                                                   predict_fix, predict_mag, predict_velocity)
-from imu_fusion.geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from imu_fusion.estimation.smoother.transition import (adjoint_rows, apply_step, boxminus,
+                                                       boxplus, interval_noise,
+                                                       propagate_rows, slow_noise)
 
 #: Longest list of non-zero entries of a row: all states, should one not be finite.
 MAX_ENTRIES = CORE + sum(width for _, width in BLOCKS)
@@ -32,90 +34,8 @@ THINNING = 16
 
 
 @njit(cache=True)
-def boxplus(x, delta):
-    """State x (n + 1,) moved by an error state delta (n,), in place."""
-    turned = quat_multiply(x[6:10], quat_exp(delta[ATT:ATT + 3]))
-    turned /= math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2 + turned[3] ** 2)
-    x[6:10] = turned
-    for i in range(6):
-        x[i] += delta[i]
-    for i in range(9, len(delta)):
-        x[i + 1] += delta[i]
-
-
-@njit(cache=True)
-def boxminus(a, b, out):
-    """out (n,) with a = b [+] out, for states a, b (n + 1,)."""
-    out[ATT:ATT + 3] = quat_log(quat_multiply(quat_conjugate(b[6:10]), a[6:10]))
-    for i in range(6):
-        out[i] = a[i] - b[i]
-    for i in range(9, len(out)):
-        out[i] = a[i + 1] - b[i + 1]
-
-
-@njit(cache=True)
-def _propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
-    """out = F @ m for a matrix m (n, k)."""
-    n, width = m.shape
-    for i in range(3):
-        for j in range(width):
-            out[VEL + i, j] = m[VEL + i, j]
-            out[ATT + i, j] = 0.0
-        for c in columns:
-            v, a = f_vel[i, c], f_att[i, c]
-            for j in range(width):
-                out[VEL + i, j] += v * m[c, j]
-            if a != 0.0:
-                for j in range(width):
-                    out[ATT + i, j] += a * m[c, j]
-        for j in range(width):
-            out[POS + i, j] = m[POS + i, j] + 0.5 * dt * (m[VEL + i, j] + out[VEL + i, j])
-    for i in range(9, n):
-        for j in range(width):
-            out[i, j] = decay[i] * m[i, j]
-
-
-@njit(cache=True)
-def _adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
-    """out = F.T @ m for a matrix m (n, k)."""
-    n, width = m.shape
-    for i in range(3):
-        for j in range(width):
-            out[POS + i, j] = m[POS + i, j]
-            out[VEL + i, j] = m[VEL + i, j] + dt * m[POS + i, j]
-            out[ATT + i, j] = 0.0
-    for i in range(9, n):
-        for j in range(width):
-            out[i, j] = decay[i] * m[i, j]
-    for i in range(3):
-        for c in columns:
-            v, a = f_vel[i, c], f_att[i, c]
-            for j in range(width):
-                out[c, j] += v * (m[VEL + i, j] + 0.5 * dt * m[POS + i, j])
-            if a != 0.0:
-                for j in range(width):
-                    out[c, j] += a * m[ATT + i, j]
-
-
-@njit(cache=True)
-def _interval_noise(q_acc, middle, dt, spread):
-    """spread (3, 3): covariance of the velocity step in world axes."""
-    for i in range(3):
-        for j in range(3):
-            spread[i, j] = dt * (middle[i, 0] * middle[j, 0] * q_acc[0]
-                                 + middle[i, 1] * middle[j, 1] * q_acc[1]
-                                 + middle[i, 2] * middle[j, 2] * q_acc[2])
-
-
-@njit(cache=True)
-def _slow_noise(walk, rate, dt, factor):
-    """Variance that a slow state gains; factor is its decay over dt."""
-    return walk * dt if rate == 0.0 else 0.5 * walk / rate * (1.0 - factor * factor)
-
-
-@njit(cache=True)
 def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, innovation,
-                   store, storage):
+                   storage):
     """Filter samples first <= k < last; ``delta`` and ``cov`` are those before the rows of
     ``first`` on entry, before the rows of ``last`` on return.
 
@@ -131,8 +51,9 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             (M, 3, 3), squared scale of the robust loss (0: squared loss).
         rows: constraints sorted by sample: start (N + 1,), residual, gradient, sigma, height.
         innovation: (M, 3) normalised innovations, result.
-        store: whether to fill ``storage`` for the backward pass: entries, indices, count, gain,
-            value and start of the rows; deviation and covariance after the rows.
+        storage: what the backward pass needs (:func:`make_storage`): entries, indices, count,
+            gain, value and start of the rows; deviation and covariance after the rows. Filled
+            unless it was made for no sample.
 
     Returns:
         Sum of the losses of all rows at the nominal trajectory.
@@ -141,6 +62,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
     m_start, m_kind, m_tau, m_value, m_whiten, m_loss = measured
     c_start, c_residual, c_gradient, c_sigma, c_height = rows
     (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
+    store = len(s_delta) > 0
     n = len(delta)
     n_total = len(x)
     f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
@@ -253,15 +175,15 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
         else:
             boxminus(x_next, x[k + 1], defect)
             column[:, 0] = delta
-            _propagate_rows(column, column_out, dt, decay, f_vel, f_att, columns)
+            propagate_rows(column, column_out, dt, decay, f_vel, f_att, columns)
             for i in range(n):
                 delta[i] = column_out[i, 0] + defect[i]
-        _propagate_rows(cov, work, dt, decay, f_vel, f_att, columns)
+        propagate_rows(cov, work, dt, decay, f_vel, f_att, columns)
         for i in range(n):
             for j in range(n):
                 work_t[j, i] = work[i, j]
-        _propagate_rows(work_t, cov, dt, decay, f_vel, f_att, columns)
-        _interval_noise(noise[k, 3:6], middle, dt, spread)
+        propagate_rows(work_t, cov, dt, decay, f_vel, f_att, columns)
+        interval_noise(noise[k, 3:6], middle, dt, spread)
         for i in range(3):
             cov[ATT + i, ATT + i] += noise[k, i] * dt
             for j in range(3):
@@ -270,7 +192,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
                 cov[VEL + i, POS + j] += 0.5 * dt * spread[i, j]
                 cov[POS + i, POS + j] += 0.25 * dt * dt * spread[i, j]
         for i in range(9, n):
-            cov[i, i] += _slow_noise(walks[i], rates[i], dt, decay[i])
+            cov[i, i] += slow_noise(walks[i], rates[i], dt, decay[i])
         # The two products round differently on either side of the diagonal.
         for i in range(n):
             for j in range(i):
@@ -353,24 +275,24 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
                 decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
             _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, spin, decay,
                                  layout, f_vel, f_att, x_next, rate, force)
-            _interval_noise(noise[k, 3:6], middle, dt, spread)
+            interval_noise(noise[k, 3:6], middle, dt, spread)
             for i in range(3):
                 cost += noise[k, i] * dt * adjoint[ATT + i] ** 2
                 for j in range(3):
                     cost += (spread[i, j] * (adjoint[VEL + i] + 0.5 * dt * adjoint[POS + i])
                              * (adjoint[VEL + j] + 0.5 * dt * adjoint[POS + j]))
             for i in range(9, n):
-                cost += (_slow_noise(walks[i], rates[i], dt, decay[i])
+                cost += (slow_noise(walks[i], rates[i], dt, decay[i])
                          * adjoint[i] ** 2)
             column[:, 0] = adjoint
-            _adjoint_rows(column, column_out, dt, decay, f_vel, f_att, columns)
+            adjoint_rows(column, column_out, dt, decay, f_vel, f_att, columns)
             adjoint[:] = column_out[:, 0]
             if with_cov:
-                _adjoint_rows(adjoint_cov, work, dt, decay, f_vel, f_att, columns)
+                adjoint_rows(adjoint_cov, work, dt, decay, f_vel, f_att, columns)
                 for i in range(n):
                     for j in range(n):
                         work_t[j, i] = work[i, j]
-                _adjoint_rows(work_t, adjoint_cov, dt, decay, f_vel, f_att, columns)
+                adjoint_rows(work_t, adjoint_cov, dt, decay, f_vel, f_att, columns)
         cov, delta = s_cov[k - first], s_delta[k - first]
         for i in range(n):
             step[k - first, i] = delta[i]
@@ -442,27 +364,8 @@ def _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out):
 
 
 @njit(cache=True)
-def apply_step(x, step, largest):
-    """Move states x (m, n + 1) by deviations step (m, n), in place; ``largest`` (3,) grows to
-    the largest change of position (m), velocity (m/s) and attitude (rad)."""
-    for k in range(len(x)):
-        boxplus(x[k], step[k])
-        for b in range(3):
-            size = math.sqrt(step[k, 3 * b] ** 2 + step[k, 3 * b + 1] ** 2
-                             + step[k, 3 * b + 2] ** 2)
-            largest[b] = max(largest[b], size)
-
-
-@njit(cache=True)
-def follow(x, count, cov, motion, measured, rows, innovation):
-    """Extended Kalman filter over the first ``count`` samples from x[0]; writes x."""
-    n = len(cov)
-    return filter_segment(0, count, True, x, np.zeros(n), cov, motion, measured, rows,
-                          innovation, False, _storage(0, 0, n))
-
-
-@njit(cache=True)
-def _storage(n_samples, n_rows, n):
+def make_storage(n_samples, n_rows, n):
+    """Arrays for a segment of n_samples with n_rows rows and n error states."""
     return (np.empty((n_rows, MAX_ENTRIES)), np.empty((n_rows, MAX_ENTRIES), np.int64),
             np.empty(n_rows, np.int64), np.empty((n_rows, n)), np.empty(n_rows),
             np.empty(n_samples + 1, np.int64), np.empty((n_samples, n)),
@@ -485,21 +388,23 @@ def solve_linear(x, delta, cov, motion, measured, rows, innovation, with_cov, co
     count = (total + SEGMENT - 1) // SEGMENT
     kept_delta, kept_cov = np.empty((count, n)), np.empty((count, n, n))
     most, cost, process = 0, 0.0, 0.0
-    nothing = _storage(0, 0, n)
+    # A constant would have the filter compiled a second time for it.
+    follow = np.zeros(1, np.bool_)[0]
+    nothing = make_storage(0, 0, n)
     for s in range(count):
         first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
         kept_delta[s], kept_cov[s] = delta, cov
         most = max(most, 3 * (measured[0][last] - measured[0][first])
                    + rows[0][last] - rows[0][first])
-        cost += filter_segment(first, last, False, x, delta, cov, motion, measured, rows,
-                               innovation, False, nothing)
-    storage = _storage(SEGMENT, most, n)
+        cost += filter_segment(first, last, follow, x, delta, cov, motion, measured, rows,
+                               innovation, nothing)
+    storage = make_storage(SEGMENT, most, n)
     step, largest = np.empty((SEGMENT, n)), np.zeros(3)
     adjoint, adjoint_cov = np.zeros(n), np.zeros((n, n))
     for s in range(count - 1, -1, -1):
         first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
-        filter_segment(first, last, False, x, kept_delta[s], kept_cov[s], motion, measured,
-                       rows, innovation, True, storage)
+        filter_segment(first, last, follow, x, kept_delta[s], kept_cov[s], motion, measured,
+                       rows, innovation, storage)
         process += smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage,
                                   with_cov, step, cov_out, var_out)
         apply_step(x[first:last], step, largest)

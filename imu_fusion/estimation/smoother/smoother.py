@@ -1,57 +1,21 @@
 """The smoother: trajectory, attitude and sensor errors from a whole recording."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.events import detect_jump, jump_result, refine_jump
 from imu_fusion.estimation.smoother import initial, iterated, model
-from imu_fusion.estimation.smoother.inputs import prepare_imu, prepare_measurements
+from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
+from imu_fusion.estimation.smoother.inputs import (prepare_imu, prepare_measurements,
+                                                   reference_frame)
 from imu_fusion.estimation.smoother.params import SmootherParams
-from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.geometry.gravity import earth_rate_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
 from imu_fusion.surfaces.hill import Hill
 
-SAMPLE = np.dtype([
-    ("stamp", "i8"), ("position_world", "f8", 3), ("vel_world", "f8", 3),
-    ("quat_world_imu", "f8", 4), ("acc", "f8", 3), ("gyr", "f8", 3), ("gyr_bias", "f8", 3),
-    ("acc_bias", "f8", 3), ("cov_position", "f8", (3, 3)), ("cov_velocity", "f8", (3, 3)),
-    ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3)])
-
 _KINDS = {model.FIX: "fix", model.VELOCITY: "velocity", model.MAG: "mag"}
-
-
-@dataclass(frozen=True)
-class SmootherResult:
-    """What the smoother found.
-
-    ``samples``: structured array (:data:`SAMPLE`), one per usable Imu sample; ``acc`` and
-    ``gyr`` are corrected of the estimated errors, in the imu frame; ``cov_attitude`` is that
-    of the rotation vector in imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
-    optional states, in SI units. ``innovations``: name -> (stamp (m,), normalised
-    innovations (m, 3)), white with unit variance where the model is right.
-    ``cost``: of the trajectory before each step; ``iterations`` counts the steps.
-    """
-
-    samples: np.ndarray
-    frame: LocalFrame
-    states: dict
-    innovations: dict
-    cost: tuple
-    iterations: int
-    converged: bool
-    events: object = None
-    jump: object = None
-
-    def summary(self):
-        """One line."""
-        jump = f", jump length {self.jump.length:.1f} m" if self.jump else ""
-        state = "converged" if self.converged else "did not converge"
-        return (f"{len(self.samples)} samples, {self.iterations} iterations ({state}), "
-                f"cost {self.cost[-1]:.6g}{jump}")
 
 
 class Smoother:
@@ -83,7 +47,6 @@ class Smoother:
         """
         params, surface = self.params, self.surface
         if params.method == "extended_rts":
-            from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
             return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events)
         prepared = prepare_imu(imu, params)
         frame = reference_frame(surface, fix)
@@ -213,19 +176,6 @@ class Smoother:
             jump = jump_result(hill, samples, log, events)
         return SmootherResult(samples, frame, states, innovations, tuple(problem.cost), steps,
                               converged, events, jump)
-
-
-def reference_frame(surface, fix):
-    """The surface's frame, or one at the first valid fix."""
-    if surface is not None:
-        return surface.origin
-    valid = np.flatnonzero(fix.status >= 0) if fix is not None else ()
-    if not len(valid):
-        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
-                              "alone is the job of the orientation estimator")
-    i = valid[0]
-    return LocalFrame(float(fix.latitude_deg[i]), float(fix.longitude_deg[i]),
-                      float(fix.height[i]))
 
 
 def _positions(problem):

@@ -5,12 +5,13 @@ DDS drops messages when a subscriber lags (KEEP_LAST) or blocks the publisher
 (the replayer, or a node that processes a session of somebody else):
 
 1. The source announces the session on ``/flow/status``: its topics, with types
-   and the sequence number after which the session starts.
-   It names the sinks that it knows, so that a node between waits for the same:
-   two nodes that the source has discovered may not have discovered each other.
+   and the sequence number after which the session starts, and the sinks that it
+   knows. A node between waits for the same sinks: two nodes that the source has
+   discovered may not have discovered each other.
 2. Every node that owns a :class:`FlowSink` (seen in the graph as a publisher of
    ``/flow/ack``) answers on ``/flow/ack`` which of the topics it takes. The
-   source sends nothing before all have answered and their subscriptions match.
+   source sends nothing before all have answered, and their subscriptions are
+   reliable and matched.
 3. Sinks acknowledge the highest sequence number received. The source keeps at
    most ``WINDOW`` messages per topic unacknowledged, less than the queue depth.
 4. At the end the source states the last sequence number of each topic, so that

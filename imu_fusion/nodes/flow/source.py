@@ -241,7 +241,8 @@ class FlowSource:
                 self._seen.discard(name)
         self.foreign = {}
         for topic in self._publishers:
-            others = {full_name(i) for i in self._node.get_subscriptions_info_by_topic(topic)}
+            others = {full_name(i) for i in self._node.get_subscriptions_info_by_topic(topic)
+                      if i.node_name != _UNKNOWN_NODE}
             others -= sinks | {self._name} | self._consumers.keys()
             if others:
                 self.foreign[topic] = sorted(others)
@@ -304,7 +305,7 @@ class FlowSource:
             for publisher in self._publishers.values():
                 publisher.limit = _UNBOUNDED
             if self._begin_after_drain:
-                self.begin()
+                self.begin(self._company)
         self._on_ready()
 
     def _announce_end(self):

@@ -1,0 +1,106 @@
+"""Steps on the manifold of states, and products with the transition matrix (numba).
+
+The transition matrix F is never formed: its rows of velocity and attitude come from
+:func:`.model.interval`, those of the position follow by the trapezoidal rule, and slow
+states only decay.
+"""
+
+import math
+
+from numba import njit
+
+from imu_fusion.estimation.smoother.model import ATT, POS, VEL
+from imu_fusion.geometry.rotation import (quat_conjugate, quat_exp, quat_log, quat_multiply,
+                                          quat_normalize)
+
+
+@njit(cache=True)
+def boxplus(x, delta):
+    """State x (n + 1,) moved by an error state delta (n,), in place."""
+    x[6:10] = quat_normalize(quat_multiply(x[6:10], quat_exp(delta[ATT:ATT + 3])))
+    for i in range(6):
+        x[i] += delta[i]
+    for i in range(9, len(delta)):
+        x[i + 1] += delta[i]
+
+
+@njit(cache=True)
+def boxminus(a, b, out):
+    """out (n,) with a = b [+] out, for states a, b (n + 1,)."""
+    out[ATT:ATT + 3] = quat_log(quat_multiply(quat_conjugate(b[6:10]), a[6:10]))
+    for i in range(6):
+        out[i] = a[i] - b[i]
+    for i in range(9, len(out)):
+        out[i] = a[i + 1] - b[i + 1]
+
+
+@njit(cache=True)
+def propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
+    """out = F @ m for a matrix m (n, k)."""
+    n, width = m.shape
+    for i in range(3):
+        for j in range(width):
+            out[VEL + i, j] = m[VEL + i, j]
+            out[ATT + i, j] = 0.0
+        for c in columns:
+            v, a = f_vel[i, c], f_att[i, c]
+            for j in range(width):
+                out[VEL + i, j] += v * m[c, j]
+            if a != 0.0:
+                for j in range(width):
+                    out[ATT + i, j] += a * m[c, j]
+        for j in range(width):
+            out[POS + i, j] = m[POS + i, j] + 0.5 * dt * (m[VEL + i, j] + out[VEL + i, j])
+    for i in range(9, n):
+        for j in range(width):
+            out[i, j] = decay[i] * m[i, j]
+
+
+@njit(cache=True)
+def adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
+    """out = F.T @ m for a matrix m (n, k)."""
+    n, width = m.shape
+    for i in range(3):
+        for j in range(width):
+            out[POS + i, j] = m[POS + i, j]
+            out[VEL + i, j] = m[VEL + i, j] + dt * m[POS + i, j]
+            out[ATT + i, j] = 0.0
+    for i in range(9, n):
+        for j in range(width):
+            out[i, j] = decay[i] * m[i, j]
+    for i in range(3):
+        for c in columns:
+            v, a = f_vel[i, c], f_att[i, c]
+            for j in range(width):
+                out[c, j] += v * (m[VEL + i, j] + 0.5 * dt * m[POS + i, j])
+            if a != 0.0:
+                for j in range(width):
+                    out[c, j] += a * m[ATT + i, j]
+
+
+@njit(cache=True)
+def interval_noise(q_acc, middle, dt, spread):
+    """spread (3, 3): covariance of the velocity step in world axes."""
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] = dt * (middle[i, 0] * middle[j, 0] * q_acc[0]
+                                 + middle[i, 1] * middle[j, 1] * q_acc[1]
+                                 + middle[i, 2] * middle[j, 2] * q_acc[2])
+
+
+@njit(cache=True)
+def slow_noise(walk, rate, dt, factor):
+    """Variance that a slow state gains; factor is its decay over dt."""
+    return walk * dt if rate == 0.0 else 0.5 * walk / rate * (1.0 - factor * factor)
+
+
+@njit(cache=True)
+def apply_step(x, step, largest):
+    """Move states x (m, n + 1) by deviations step (m, n), in place; ``largest`` (3,) grows to
+    the largest change of position (m), velocity (m/s) and attitude (rad)."""
+    for k in range(len(x)):
+        boxplus(x[k], step[k])
+        for b in range(3):
+            size = math.sqrt(step[k, 3 * b] ** 2 + step[k, 3 * b + 1] ** 2
+                             + step[k, 3 * b + 2] ** 2)
+            largest[b] = max(largest[b], size)

@@ -1,0 +1,76 @@
+"""A recording through real ROS 2 nodes, smoothed and recorded: one call.
+
+    replayer -> smoother, orientation_estimator -> recorder; pipeline calls smoother/smooth
+
+Each node is a process of an own ROS domain. The estimates are those of ``batch.process``.
+"""
+
+from pathlib import Path
+
+from imu_fusion.batch import inputs_of, stages
+from imu_fusion.errors import TopicError
+from imu_fusion.graph import Graph
+from imu_fusion.messages.bag import open_bag
+
+SMOOTHER = "smoother"
+_PATIENCE = 3600.0  # s; the nodes notice by themselves when nothing can come any more
+
+
+def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, logs=None,
+        show=True):
+    """Replay a recording through the estimators into a new recording.
+
+    Args:
+        bag: recording with what the smoother needs.
+        out: rosbag2 directory to write: the recording, with old estimates left out, and the
+            new ones.
+        params_file: ROS 2 parameter file for all nodes, or None for defaults.
+        without: node names of estimators to leave out.
+        remap: dict of topic names of ours to those in the recording.
+        overwrite: replace ``out``.
+        logs: directory for what the nodes print; a temporary one if None.
+        show: let replayer and pipeline print here.
+
+    Returns:
+        ROS domain id that was used.
+
+    Raises:
+        ImuFusionError: recording, parameters or topics are not usable, or a node failed.
+    """
+    known = stages()
+    for name in without:
+        if name not in known or name == SMOOTHER:
+            raise TopicError(f"no estimator '{name}' to leave out; there are: "
+                             + ", ".join(set(known) - {SMOOTHER}))
+    renamed, estimators, made = {}, [], set()
+    with open_bag(bag) as reader:
+        for stage in known.values():
+            # Here, for a bad file to be refused before anything starts.
+            stage, _ = stage.prepare(params_file)
+            if stage.node in without or stage.unusable:
+                continue
+            names, missing = inputs_of(stage, reader, remap or {})
+            if missing and stage.node != SMOOTHER:
+                continue
+            if missing:
+                raise TopicError(f"nothing to smooth: {missing}")
+            estimators.append(stage.node)
+            made |= stage.outputs.keys()
+            renamed |= {name: topic for topic, name in names.items()
+                        if name.lstrip("/") != topic}
+        old = tuple(name for name in reader.topics if name.lstrip("/") in made)
+    common = {"params_file": params_file and Path(params_file).absolute()}
+    with Graph(logs) as graph:
+        graph.start("recorder", **common, out=str(Path(out).absolute()), overwrite=overwrite,
+                    end_with_sources=True, expected_sources=(SMOOTHER,))
+        for node in estimators:
+            graph.start(node, **common, qos="reliable")
+        graph.start("pipeline", show=show, **common)
+        graph.start("replayer", show=show, **common, bag=str(Path(bag).absolute()), rate=0.0,
+                    exclude=old,
+                    remap=tuple(f"{name}:=/{topic}" for name, topic in renamed.items()),
+                    wait_for_subscribers=0, wait_for_nodes=("recorder", "pipeline", *estimators))
+        graph.wait("replayer", _PATIENCE)
+        graph.wait("pipeline", _PATIENCE)
+        graph.wait("recorder", 60.0)
+        return graph.domain

@@ -1,0 +1,163 @@
+"""What the report needs of an acceleration field: estimates and readings, read from recordings."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.batch import field_configuration
+from imu_fusion.estimation.acceleration_field_rows import (ROW, SATURATED, field_at,
+                                                           rigid_gradient)
+from imu_fusion.estimation.impact_metrics import measure_impacts
+from imu_fusion.messages.acceleration_field_stream import (ACCEL_TOPIC, GYROSCOPE_TOPIC, IMU_TOPIC,
+                                                           NODE, FieldConfiguration)
+from imu_fusion.messages.bag import find_topic, open_bag
+from imu_fusion.messages.convert import attitude_log, read_log
+from imu_fusion.messages.layouts import ACCEL, IMU
+
+
+@dataclass(frozen=True, eq=False)
+class FieldData:
+    """Estimates of a field as rows (ROW), what was measured, and where.
+
+    ``readings`` maps accelerometers to (n, 3) m/s^2 in their own axes, NaN where there is none;
+    ``gyr`` (n, 3) rad/s of the gyroscope in body axes, NaN where there is none, or None.
+    """
+
+    rows: np.ndarray
+    config: FieldConfiguration
+    readings: dict
+    gyr: np.ndarray | None
+    impacts: list
+
+    @property
+    def points(self):
+        """Query points (p, 3) m; the origin if none are named."""
+        points = np.reshape(self.config.field.points, (-1, 3))
+        return points if len(points) else np.zeros((1, 3))
+
+    @property
+    def places(self):
+        """dict of accelerometer to its position (3,) m."""
+        return {name: np.array(a.position) for name, a in self.config.accelerometers.items()}
+
+    def field(self, points):
+        """(specific force, kinematic acceleration), each (n, p, 3) m/s^2 in body axes."""
+        return field_at(self.rows, points, self.config.field.gravity)[:2]
+
+    def residuals(self, name):
+        """Readings of an accelerometer minus the estimated field, (n, 3) in its own axes."""
+        sensor = self.config.accelerometers[name]
+        force, kinematic = self.field([sensor.position])
+        felt = force if sensor.reports == "specific_force" else kinematic
+        residual = self.readings[name] - felt[:, 0] @ np.reshape(sensor.axes, (3, 3)).T
+        residual[:, [axis not in sensor.measured_axes for axis in "xyz"]] = np.nan
+        return residual
+
+    @property
+    def clipped(self):
+        """(n, 3) whether an axis of the gyroscope was taken to be at its limit."""
+        limit = self.config.gyroscope.range if self.config.gyroscope else None
+        if self.gyr is None or limit is None:
+            return np.zeros((len(self.rows), 3), dtype=bool)
+        axes = np.reshape(self.config.gyroscope.axes, (3, 3))
+        own = np.abs(np.nan_to_num(self.gyr) @ axes.T) >= limit
+        return (own.astype(float) @ np.abs(axes)) > 0.5
+
+
+def read_field(bag, estimates, params_file=None):
+    """FieldData of a recording and of the one with its estimates; None if it holds none.
+
+    Args:
+        bag: recording with the accelerometers.
+        estimates: recording with acceleration_field/imu and acceleration_field/accel.
+        params_file: parameter file of the estimator, or None: then nothing is known of the
+            accelerometers.
+    """
+    with open_bag(estimates) as reader:
+        if any(find_topic(reader.topics, t) is None for t in (IMU_TOPIC, ACCEL_TOPIC)):
+            return None
+        imu = read_log(reader, IMU_TOPIC, attitude_log)
+        covs = _covariances(reader)
+        stamps, _, values = ACCEL.decode_many(_messages(reader, ACCEL_TOPIC))
+    shared, i, j = np.intersect1d(imu.stamp, stamps, return_indices=True)
+    if len(shared) == 0:
+        return None
+    rows = _rows(shared, imu[i], covs[i], values[j])
+    config = field_configuration(params_file)
+    readings, gyr = _measured(bag, config, rows["stamp"])
+    for name, reading in readings.items():
+        limit = config.accelerometers[name].range
+        if limit is not None:
+            with np.errstate(invalid="ignore"):
+                rows["flags"][(np.abs(reading) >= limit).any(axis=1)] |= SATURATED
+    return FieldData(rows, config, readings, gyr, _impacts(estimates, params_file, config, rows))
+
+
+def _messages(reader, topic):
+    return [cdr for *_, cdr in reader.messages([find_topic(reader.topics, topic)])]
+
+
+def _covariances(reader):
+    """(n, 2, 3, 3) of rates and specific force as published."""
+    _, _, values = IMU.decode_many(_messages(reader, IMU_TOPIC))
+    return np.stack([values[:, IMU[f"{field}_covariance"]].reshape(-1, 3, 3) for field in
+                     ("angular_velocity", "linear_acceleration")], axis=1)
+
+
+def _rows(stamps, imu, covs, accel):
+    rows = np.zeros(len(stamps), ROW)
+    rows["stamp"], rows["omega"], rows["specific_force"] = stamps, imu.gyr, imu.acc
+    rows["quat"], rows["cov_attitude"] = imu.quat_world_imu, imu.cov_attitude
+    rows["cov_omega"], rows["cov_specific_force"] = covs[:, 0], covs[:, 1]
+    rows["alpha"] = accel[:, ACCEL["angular"]]
+    cov = accel[:, ACCEL["covariance"]].reshape(-1, 6, 6)
+    turn = Rotation.from_quat(rows["quat"])
+    rotation = turn.as_matrix()
+    rows["acceleration_world"] = turn.apply(accel[:, ACCEL["linear"]])
+    rows["cov_acceleration_world"] = rotation @ cov[:, :3, :3] @ rotation.transpose(0, 2, 1)
+    rows["cov_alpha"] = cov[:, 3:, 3:]
+    rows["gradient"] = [rigid_gradient(w, a) for w, a in zip(rows["omega"], rows["alpha"])]
+    rows["residual_rms"] = np.nan
+    return rows
+
+
+def _measured(bag, config, stamps):
+    """Readings of the accelerometers and the gyroscope at the stamps of the estimates."""
+    readings, gyr = {}, None
+    tolerance = int(round(config.matching.match__tolerance * 1e9))
+    with open_bag(bag) as reader:
+        for name in config.accelerometers:
+            topic = f"accelerometers/{name}"
+            if find_topic(reader.topics, topic) is not None:
+                log = read_log(reader, topic)
+                readings[name] = _at(stamps, log.stamp, log.acc, tolerance)
+        if find_topic(reader.topics, GYROSCOPE_TOPIC) is not None:
+            log = read_log(reader, GYROSCOPE_TOPIC)
+            gyr = _at(stamps, log.stamp, log.gyr, tolerance)
+            if config.gyroscope is not None:
+                gyr = gyr @ np.reshape(config.gyroscope.axes, (3, 3))
+    return readings, gyr
+
+
+def _at(stamps, log_stamps, values, tolerance):
+    """Values (n, 3) of the samples within ``tolerance`` ns after ``stamps`` (n,), else NaN."""
+    result = np.full((len(stamps), 3), np.nan)
+    order = np.argsort(log_stamps, kind="stable")
+    place = np.searchsorted(log_stamps[order], stamps - tolerance)
+    known = place < len(log_stamps)
+    known[known] &= log_stamps[order][place[known]] - stamps[known] <= tolerance
+    result[known] = values[order[place[known]]]
+    return result
+
+
+def _impacts(estimates, params_file, config, rows):
+    """Metrics that ``process`` has written beside the estimates, or of the rows."""
+    found = Path(estimates) / "results.json"
+    if found.exists():
+        return json.loads(found.read_text()).get(NODE, {}).get("impacts", [])
+    if params_file is None:
+        return []
+    return measure_impacts(rows, config.field.points, config.field.gravity, config.impact)

@@ -1,0 +1,358 @@
+"""Sections about a smoothed trajectory: where, how fast, how sure, and whether it fits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.report import figures as fig
+from imu_fusion.report.figures import Band, Line, Panel, time_figure
+from imu_fusion.report.html import Figure, Number, Section, Table, Text
+from imu_fusion.report.orientation import angle_panels
+from imu_fusion.report.overview import number
+from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
+from imu_fusion.samples import AttitudeLog, seconds
+from imu_fusion.surfaces.hill import Hill
+
+_ENU, _XYZ = ("east", "north", "up"), ("x", "y", "z")
+_INNOVATIONS = {"fix": ("position", _ENU), "velocity": ("velocity", _ENU),
+                "mag": ("magnetic field", _XYZ)}
+# Optional states: title, unit, factor to that unit, names of the components.
+_STATES = {
+    "mag_bias": ("magnetometer bias", "µT", 1e6, _XYZ),
+    "mag_scale": ("magnetometer scale", "%", 100.0, _XYZ),
+    "gnss_position_error": ("GNSS position error", "m", 1.0, _ENU),
+    "gnss_time_offset": ("delay of the GNSS", "ms", 1e3, ("delay",)),
+    "velocity_time_offset": ("further delay of velocities", "ms", 1e3, ("delay",)),
+    "acc_matrix": ("accelerometer matrix", "%", 100.0, tuple(a + b for a in "xyz" for b in "xyz")),
+    "gyr_scale": ("gyroscope scale", "%", 100.0, _XYZ),
+    "gnss_lever_arm": ("antenna in the imu frame", "m", 1.0, _XYZ),
+    "body_height": ("height above the surface", "m", 1.0, ("height",)),
+}
+_BOUND, _IDEAL = 1.96, 95.0  # of a standard normal distribution, and its share within, %
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A SmootherResult with what it was made from: ``params``, ``surface`` or None, FixLog and
+    VelocityLog (or None) and ``origin``, int ns, the zero of the time axes."""
+
+    result: object
+    params: object
+    surface: object
+    fix: object
+    velocity: object
+    origin: int
+
+    @property
+    def time(self):
+        """(n,) s of the samples."""
+        return seconds(self.result.samples["stamp"], self.origin)
+
+    def fixes_world(self):
+        """Valid fixes: FixLog and positions (m, 3) m."""
+        fix = self.fix[(self.fix.status >= 0) & np.isfinite(self.fix.latitude_deg)
+                       & np.isfinite(self.fix.height)]
+        return fix, self.result.frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
+
+    def delay(self, *states):
+        """ns by which stamps are late, as far as states of these names have found it."""
+        return sum(int(round(float(self.result.states[name][0][0, 0]) * 1e9))
+                   for name in states if name in self.result.states)
+
+    def antenna(self, stamp):
+        """Position (m, 3) of the antenna at stamps of fixes, NaN outside of the samples."""
+        samples, states = self.result.samples, self.result.states
+        lever = states["gnss_lever_arm"][0] if "gnss_lever_arm" in states else \
+            np.tile(self.params.gnss_lever_arm, (len(samples), 1))
+        place = samples["position_world"] + Rotation.from_quat(
+            samples["quat_world_imu"]).apply(lever)
+        return interpolate(samples["stamp"], place, stamp - self.delay("gnss_time_offset"))
+
+
+def interpolate(stamp, columns, at):
+    """Columns (n, k) at other stamps (m,), NaN outside."""
+    since, at = stamp - stamp[0], at - stamp[0]
+    return np.column_stack([np.interp(at, since, column, left=np.nan, right=np.nan)
+                            for column in columns.T])
+
+
+def smoother_sections(smoothed, reference=None):
+    """Sections about a smoothed trajectory.
+
+    Args:
+        smoothed: Smoothed.
+        reference: PoseLog of the truth in the world of the smoother, or None.
+    """
+    sections = [_trajectory(smoothed)]
+    if smoothed.result.jump is not None:
+        sections.append(_jump(smoothed))
+    if reference is not None:
+        sections.append(_truth(smoothed, reference))
+    sections += [_velocity(smoothed), _attitude(smoothed), _errors(smoothed),
+                 _before_after(smoothed), _innovations(smoothed)]
+    if smoothed.surface is not None:
+        sections.append(_residuals(smoothed))
+    return sections
+
+
+def smoother_numbers(result):
+    """The key numbers of a result: a tuple of Number."""
+    sd = np.sqrt(np.median(np.trace(result.samples["cov_position"], axis1=1, axis2=2)))
+    state = "converged" if result.converged else "NOT CONVERGED"
+    items = [Number("Iterations", str(result.iterations), state),
+             Number("Position σ", f"{number(sd, 2)} m", "3D, median")]
+    if result.jump is not None:
+        items.insert(0, Number("Jump", f"{number(result.jump.length, 1)} m",
+                               f"± {number(result.jump.length_sd, 2)} m (1σ)"))
+    return tuple(items)
+
+
+def _trajectory(smoothed):
+    samples = smoothed.result.samples
+    _, fixes = smoothed.fixes_world()
+    figure, stretch = space_figure(samples, smoothed.time, fixes, smoothed.surface)
+    heights = f" Heights are stretched by {stretch:.1f}." if stretch > 1.0 else ""
+    place = "the origin of the surface" if smoothed.surface is not None else "the first fix"
+    step = np.diff(samples["position_world"], axis=0)
+    rows = (("length of the path", number(np.linalg.norm(step, axis=1).sum(), 1), "m"),
+            *((f"extent {name}", number(np.ptp(samples["position_world"][:, i]), 1), "m")
+              for i, name in enumerate(_ENU)),
+            ("greatest speed", number(np.linalg.norm(samples["vel_world"], axis=1).max(), 2),
+             "m/s"))
+    return Section("Trajectory", (
+        Text(smoothed.result.summary()[:1].upper() + smoothed.result.summary()[1:]
+             + f". East, north and up are counted from {place}."),
+        Figure(figure, "Drag to turn, scroll to come closer." + heights, linked=False),
+        Figure(map_figure(samples, fixes), "From above: fixes as recorded, and smoothed.",
+               linked=False),
+        Table(("quantity", "value", "unit"), rows)))
+
+
+def _jump(smoothed):
+    jump, result = smoothed.result.jump, smoothed.result
+    rows = (("jump length", number(jump.length, 2), "m"),
+            ("its standard deviation", number(jump.length_sd, 2), "m"),
+            ("in-run speed, last 10 m of the table", number(jump.in_run_speed, 2), "m/s"),
+            ("take-off speed", number(jump.takeoff_speed, 2), "m/s"),
+            ("take-off angle, upwards positive", number(jump.takeoff_angle_deg, 2), "°"),
+            ("flight time", number(jump.flight_time, 3), "s"),
+            ("landing speed", number(jump.landing_speed, 2), "m/s"),
+            ("take-off", number(float(seconds(jump.takeoff_stamp, smoothed.origin)), 3), "s"),
+            ("touch-down", number(float(seconds(jump.touchdown_stamp, smoothed.origin)), 3), "s"))
+    figure = side_figure(smoothed.surface, result.samples, smoothed.fixes_world()[1],
+                         result.events)
+    return Section("Jump", (
+        Table(("quantity", "value", "unit"), rows,
+              "The length is counted along the landing profile, as the markers of a hill stand."),
+        Figure(figure, "From the side, at one scale: drag to zoom, double-click to go back.",
+               linked=False)))
+
+
+def _flight(smoothed):
+    """[(start, end)] s in the air, for shading."""
+    events = smoothed.result.events
+    if events is None:
+        return ()
+    return [tuple(float(seconds(s, smoothed.origin)) for s in (events.takeoff, events.touchdown))]
+
+
+def _figure(smoothed, panels, caption="", **options):
+    return Figure(time_figure(panels, _flight(smoothed), "in the air", **options), caption)
+
+
+def _banded(time, values, sd, name, color=fig.ESTIMATE, label="±3σ"):
+    return (Band(label, time, values - 3 * sd, values + 3 * sd), Line(name, time, values, color))
+
+
+def _sd(cov):
+    return np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))
+
+
+def _truth(smoothed, reference):
+    """Errors of position and attitude against a reference."""
+    samples = smoothed.result.samples
+    _, i, j = np.intersect1d(samples["stamp"], reference.stamp, return_indices=True)
+    rows, truth = samples[i], reference[j]
+    time = seconds(rows["stamp"], smoothed.origin)
+    position = rows["position_world"] - truth.position_world
+    attitude = np.degrees((Rotation.from_quat(rows["quat_world_imu"]).inv()
+                           * Rotation.from_quat(truth.quat_world_imu)).as_rotvec())
+    panels, table = [], []
+    for error, cov, scale, unit, names, what in (
+            (position, rows["cov_position"], 1.0, "m", _ENU, "position"),
+            (attitude, rows["cov_attitude"], np.degrees(1.0), "°", _XYZ, "attitude about")):
+        sd = scale * _sd(cov)
+        ratio = np.mean(np.einsum("ni,ni->n", error / scale, np.linalg.solve(
+            cov, (error / scale)[..., None])[..., 0]))
+        rms = np.sqrt(np.mean(error ** 2, axis=0))
+        table.append((what.removesuffix(" about"), *(number(r, 3) for r in rms), unit,
+                      number(ratio, 2)))
+        panels += [Panel(f"{name} in {unit}", (
+            Band("±3σ stated", time, -3 * sd[:, k], 3 * sd[:, k]),
+            Line("error", time, error[:, k], fig.ESTIMATE)), title=f"{what} {name}")
+            for k, name in enumerate(names)]
+    return Section("Errors", (
+        Table(("error", "RMS east or x", "RMS north or y", "RMS up or z", "unit", "NEES"),
+              tuple(table), "Against the truth of the recording. NEES: mean of the squared "
+              "errors by their stated covariance; 3 if that is honest."),
+        _figure(smoothed, panels, panel_height=130)))
+
+
+def _velocity(smoothed):
+    samples, time = smoothed.result.samples, smoothed.time
+    sd = _sd(samples["cov_velocity"])
+    speed = np.linalg.norm(samples["vel_world"], axis=1)
+    velocity = smoothed.velocity
+    panels = []
+    if velocity is not None:
+        late = smoothed.delay("gnss_time_offset", "velocity_time_offset")
+        gnss_time = seconds(velocity.stamp - late, smoothed.origin)
+    for i, name in enumerate(_ENU):
+        items = list(_banded(time, samples["vel_world"][:, i], sd[:, i], "smoothed"))
+        if velocity is not None:
+            items.insert(1, Line("GNSS", gnss_time, velocity.vel_world[:, i], fig.HIGHLIGHT,
+                                 markers=True))
+        panels.append(Panel(f"{name} in m/s", tuple(items)))
+    panels.append(Panel("speed in m/s", (Line("smoothed", time, speed, fig.ESTIMATE),),
+                        from_zero=True))
+    position_sd = _sd(samples["cov_position"])
+    panels.append(Panel("position σ in m", tuple(
+        Line(f"σ {name}", time, position_sd[:, i], color)
+        for i, (name, color) in enumerate(zip(_ENU, fig.AXES.values()))), from_zero=True))
+    return Section("Velocity", (_figure(
+        smoothed, panels, "Velocities of the receiver are drawn at their stamps less the delay "
+        "that was found, if it was asked for. Below: how sure the position is.",
+        panel_height=170),))
+
+
+def _attitude(smoothed):
+    samples = smoothed.result.samples
+    log = AttitudeLog(samples["stamp"], quat_world_imu=samples["quat_world_imu"],
+                      cov_attitude=samples["cov_attitude"], gyr=samples["gyr"],
+                      acc=samples["acc"])
+    sd = np.degrees(_sd(samples["cov_attitude"]))
+    panels = [*angle_panels(log, smoothed.origin), Panel("σ in °", tuple(
+        Line(f"σ about {name}", smoothed.time, sd[:, i], color)
+        for i, (name, color) in enumerate(fig.AXES.items())), from_zero=True)]
+    return Section("Attitude of the trajectory", (_figure(
+        smoothed, panels, "Roll, pitch and yaw of the sensor in east-north-up (yaw counter-"
+        "clockwise from east). Near a pitch of ±90° roll and yaw cannot be told apart and jump; "
+        "the standard deviations below are about the sensor's axes.", panel_height=170),))
+
+
+def _errors(smoothed):
+    samples, time = smoothed.result.samples, smoothed.time
+    panels = []
+    for name, unit, scale in (("gyr", "°/s", np.degrees(1.0)), ("acc", "m/s²", 1.0)):
+        what = {"gyr": "gyroscope bias", "acc": "accelerometer bias"}[name]
+        panels.append(_components(time, scale * samples[f"{name}_bias"],
+                                  scale * samples[f"{name}_bias_sd"], what, unit, _XYZ))
+    rows = []
+    for name, (values, sd) in smoothed.result.states.items():
+        what, unit, scale, names = _STATES[name]
+        # Constant states wander by rounding only.
+        if (np.ptp(values, axis=0) > 1e-6 * sd.max(axis=0)).any():
+            panels.append(_components(time, scale * values, scale * sd, what, unit, names))
+        else:
+            rows += [(what, part, number(scale * values[0, i], 3), number(scale * sd[0, i], 3),
+                      unit) for i, part in enumerate(names)]
+    blocks = [_figure(smoothed, panels, "Errors of the sensors as estimated, with three "
+                      "standard deviations.", panel_height=180)]
+    if rows:
+        blocks.append(Table(("constant state", "", "value", "σ", "unit"), tuple(rows)))
+    return Section("Sensor errors", tuple(blocks))
+
+
+def _components(time, values, sd, what, unit, names):
+    items = []
+    for i, (part, color) in enumerate(zip(names, fig.SERIES if len(names) > 3 else
+                                          fig.AXES.values())):
+        items.append(Band(f"±3σ {part}", time, values[:, i] - 3 * sd[:, i],
+                          values[:, i] + 3 * sd[:, i], color, 0.16))
+        items.append(Line(part, time, values[:, i], color))
+    return Panel(f"in {unit}", tuple(items), title=what)
+
+
+def _before_after(smoothed):
+    """Fixes less the smoothed trajectory."""
+    fix, fixes = smoothed.fixes_world()
+    difference = fixes - smoothed.antenna(fix.stamp)
+    inside = np.isfinite(difference).all(axis=1)
+    fix, difference = fix[inside], difference[inside]
+    time = seconds(fix.stamp - smoothed.delay("gnss_time_offset"), smoothed.origin)
+    sd = _sd(fix.cov_enu)
+    sd[~np.any(sd, axis=1)] = smoothed.params.fix_sd
+    rows = [(name, number(np.sqrt(np.mean(difference[:, i] ** 2)), 3),
+             number(np.median(sd[:, i]), 3), number(np.abs(difference[:, i]).max(), 3))
+            for i, name in enumerate(_ENU)]
+    panels = [Panel(f"{name} in m", (
+        Band("±3σ of the fixes", time, -3 * sd[:, i], 3 * sd[:, i], fig.NEUTRAL, 0.22),
+        Line("fix less smoothed", time, difference[:, i], fig.ESTIMATE, markers=True)))
+        for i, name in enumerate(_ENU)]
+    return Section("Before and after", (
+        Table(("fix less smoothed", "RMS m", "σ of the fixes m", "largest m"), tuple(rows)),
+        _figure(smoothed, panels, "What smoothing changed: the positions of the receiver less "
+                "those of the trajectory, within what the fixes state of themselves (or what the "
+                "parameters say where they state nothing).", panel_height=150)))
+
+
+def _innovations(smoothed):
+    """Normalised innovations with their bounds, and whether they are white."""
+    rows, panels = [], []
+    for name, (stamp, values) in smoothed.result.innovations.items():
+        what, parts = _INNOVATIONS[name]
+        time = seconds(stamp, smoothed.origin)
+        for i, part in enumerate(parts):
+            v = values[:, i]
+            centred = v - v.mean()
+            lag = np.mean(centred[1:] * centred[:-1]) / np.mean(centred ** 2) if len(v) > 2 \
+                else np.nan
+            rows.append((what, part, len(v), number(v.mean(), 2),
+                         number(np.sqrt(np.mean(v ** 2)), 2),
+                         number(100 * np.mean(np.abs(v) < _BOUND), 1), number(lag, 2)))
+        bound = np.full(len(time), _BOUND)
+        panels.append(Panel("in σ", (
+            Band(f"±{_BOUND}σ", time, -bound, bound, fig.NEUTRAL, 0.22),
+            *(Line(part, time, values[:, i], color, markers=True) for i, (part, color) in
+              enumerate(zip(parts, fig.AXES.values() if parts == _XYZ else fig.SERIES)))),
+            title=what))
+    return Section("Innovations", (
+        Table(("measurement", "", "count", "mean", "RMS", f"within ±{_BOUND}σ %",
+               "correlation with the next"), tuple(rows),
+              f"Ideal: mean 0, RMS 1, {_IDEAL:g} % within, correlation 0. Less than 1: the stated "
+              "noise is too large; more, or correlated: too small, or something is not modelled."),
+        _figure(smoothed, panels, "Measurements less their prediction from everything before "
+                "them, by their standard deviation.", panel_height=170)))
+
+
+def _residuals(smoothed):
+    """Residuals of the surface's constraints where they hold."""
+    result, panels, rows = smoothed.result, [], []
+    for constraint in smoothed.surface.constraints():
+        start, residual, *_ = evaluate_constraints(
+            [constraint], result.samples["position_world"], result.samples["stamp"],
+            result.events, smoothed.params.event_margin)
+        if not len(residual):
+            continue
+        at = np.repeat(np.arange(len(result.samples)), np.diff(start))
+        height = 0.0
+        if constraint.height:
+            height = result.states["body_height"][0][at, 0] if "body_height" in result.states \
+                else smoothed.params.body_height
+        residual = residual - height
+        time, bound = smoothed.time[at], np.full(len(at), 3.0 * constraint.sigma)
+        name = constraint.name.replace("_", " ")
+        panels.append(Panel("in m", (
+            Band("±3σ of the constraint", time, -bound, bound, fig.NEUTRAL, 0.22),
+            Line("residual", time, residual, fig.ESTIMATE)), title=name))
+        rows.append((name, len(at), number(np.sqrt(np.mean(residual ** 2)), 3),
+                     number(np.abs(residual).max(), 3), number(constraint.sigma, 3)))
+    kind = "hill" if isinstance(smoothed.surface, Hill) else "surface"
+    if not rows:
+        return Section("Surface", (Text(f"The {kind} constrains no sample."),))
+    return Section("Surface", (
+        Table(("constraint", "samples", "RMS m", "largest m", "σ m"), tuple(rows)),
+        _figure(smoothed, panels, f"How far the trajectory stands off the {kind} where it is "
+                "told to be on it.", panel_height=140)))

@@ -1,0 +1,100 @@
+"""The pipeline: replay, smooth, record; as nodes on one executor and as processes."""
+
+import pytest
+
+from imu_fusion import batch, pipeline
+from imu_fusion.errors import EstimationError, TopicError
+from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.messages.convert import fix_message, imu_message
+from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
+from imu_fusion.nodes.pipeline import Pipeline
+from imu_fusion.nodes.recorder import Recorder
+from imu_fusion.nodes.replayer import Replayer
+from imu_fusion.nodes.smoother import SmootherNode
+from test.nodes.conftest import START, STEP, write_bag
+from test.nodes.test_smoother import write
+
+
+def fields(path, topics):
+    """topic -> decoded messages: CDR padding is undefined, so bytes are not compared."""
+    with open_bag(path) as reader:
+        found = {topic: [] for topic in topics}
+        for topic, msgtype, _, cdr in reader.messages(topics):
+            layout = LAYOUTS.get(msgtype)
+            if layout is None:
+                found[topic].append(bytes(cdr))
+            else:
+                stamp, frame_id, values = layout.decode(cdr)
+                found[topic].append((stamp, frame_id, values.tobytes()))
+        return found
+
+
+def assert_same(processed, recorded, topics):
+    expected, found = fields(processed, topics), fields(recorded, topics)
+    assert all(expected.values())
+    assert found == expected
+
+
+def start(graph, bag, out, expected=("smoother",)):
+    recorder = graph.start(Recorder, out=str(out), expected_sources=list(expected))
+    graph.start(SmootherNode, qos="reliable")
+    node = graph.start(Pipeline)
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0,
+                           wait_for_nodes=["recorder", "smoother", "pipeline"])
+    return recorder, node, replayer
+
+
+def test_recording_holds_all_of_the_smoother_as_batch_writes_it(graph, tmp_path):
+    bag, out = write(tmp_path / "bag", 400), tmp_path / "out"
+    reports, _ = batch.process(bag, tmp_path / "batch", without=["orientation_estimator"])
+    recorder, node, replayer = start(graph, bag, out)
+    graph.until(lambda: replayer.finished)
+    assert not recorder.finished  # the smoother has not even begun
+    graph.close(replayer)
+    graph.until(lambda: node.finished and recorder.finished, timeout=120.0)
+    graph.close(recorder)
+    assert_same(tmp_path / "batch", out, ["/smoother/odometry", "/smoother/imu", "/smoother/fix",
+                                          "/smoother/path"])
+    assert_same(bag, out, ["/imu/data_raw", "/fix", "/fix_velocity"])
+
+
+def test_a_refusal_of_the_smoother_is_an_error_with_its_reason(graph, tmp_path):
+    bag = tmp_path / "bag"
+    with BagWriter(bag) as writer:  # fixes without a fix
+        for i in range(50):
+            stamp = START + i * STEP
+            writer.write("/imu/data_raw", IMU.msgtype,
+                         imu_message(stamp, "car", (0, 0, 0), (0, 0, 9.8)), stamp)
+            writer.write("/fix", FIX.msgtype,
+                         fix_message(stamp, "gnss", 47.0, 11.0, 600.0, status=-1), stamp)
+    _, node, replayer = start(graph, bag, tmp_path / "out")
+    graph.until(lambda: replayer.finished)
+    graph.close(replayer)
+    with pytest.raises(EstimationError, match="not smoothed: no valid GNSS fix"):
+        graph.until(lambda: node.finished, timeout=120.0)
+
+
+def test_a_replay_without_fixes_is_refused_when_it_begins(graph, tmp_path):
+    start(graph, write_bag(tmp_path / "bag", 20), tmp_path / "out")
+    with pytest.raises(TopicError, match="/replayer plays no fix"):
+        graph.until(lambda: False)
+
+
+def test_a_recording_without_fixes_is_refused_before_anything_starts(tmp_path):
+    with pytest.raises(TopicError, match="nothing to smooth: no messages on 'fix'"):
+        pipeline.run(write_bag(tmp_path / "bag", 20), tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_processes_record_what_batch_writes(tmp_path):
+    """Renamed topics and old estimates in the recording included."""
+    bag, out = tmp_path / "bag", tmp_path / "out"
+    with open_bag(write(tmp_path / "plain", 400)) as reader, BagWriter(bag) as writer:
+        for topic, msgtype, log_time, cdr in reader.messages():
+            writer.write({"/fix": "/gps/fix"}.get(topic, topic), msgtype, cdr, log_time)
+            if topic == "/imu/data_raw":
+                writer.write("/imu/data", msgtype, cdr, log_time)
+    batch.process(bag, tmp_path / "batch", remap={"fix": "/gps/fix"})
+    pipeline.run(bag, out, remap={"fix": "/gps/fix"}, show=False)
+    assert_same(tmp_path / "batch", out, ["/imu/data", "/smoother/odometry", "/smoother/imu",
+                                          "/smoother/fix", "/smoother/path"])
