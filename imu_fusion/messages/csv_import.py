@@ -88,6 +88,14 @@ class _Sensor:
             yield int(stamp), imu_message(stamp, frame_id, gyr, acc)
 
 
+class _Dumper(yaml.SafeDumper):
+    """Quotes all strings: the parser of ROS takes a bare y, n or on for a truth value."""
+
+
+_Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar(
+    "tag:yaml.org,2002:str", text, style='"'))
+
+
 def import_csv(source, description, out, overwrite=False):
     """Convert a table to a recording and, beside it, a parameter file.
 
@@ -122,7 +130,8 @@ def import_csv(source, description, out, overwrite=False):
     try:
         parameter_file.write_text(
             f"# Made from {Path(source).name} as {Path(description).name} says.\n"
-            + yaml.safe_dump({NODE: {"ros__parameters": values}}, sort_keys=False))
+            + yaml.dump({NODE: {"ros__parameters": values}}, Dumper=_Dumper, sort_keys=False,
+                        default_flow_style=None, width=100))
     except OSError as error:
         raise BagError(f"{parameter_file}: cannot be written ({error.strerror})") from None
     return parameter_file, len(stamps)
@@ -257,13 +266,22 @@ def _stamp(source, line, row, place, params):
                           "not a time") from None
 
 
+def _changed(params):
+    """The parameters that differ from their defaults."""
+    defaults = type(params)().to_mapping()
+    return {name: value for name, value in params.to_mapping().items()
+            if value != defaults.get(name)}
+
+
 def _parameters(sensors, given, stamps):
     """Nested ROS parameters of the estimator; the sample rate from the stamps if not given."""
-    arrays = {s.topic.rpartition("/")[2]: s.params.to_mapping() for s in sensors
+    arrays = {s.topic.rpartition("/")[2]: {"position": list(s.params.position),
+                                           **_changed(s.params)} for s in sensors
               if isinstance(s.params, AccelerometerParams)}
     values = {"accelerometers": {"names": list(arrays), **arrays}}
-    values |= {"gyroscope": s.params.to_mapping() for s in sensors
-               if isinstance(s.params, GyroscopeParams)}
+    # The noise is written in any case: a group without parameters would not exist.
+    values |= {"gyroscope": {"noise_density": s.params.noise_density, **_changed(s.params)}
+               for s in sensors if isinstance(s.params, GyroscopeParams)}
     flat = flatten(given)
     if "sample_rate" not in flat:
         step = np.median(np.diff(stamps))

@@ -185,7 +185,12 @@ def run_node(node_class, args=None):
         Exit code: 0 after an orderly end, 1 after an error, which is printed in one line.
     """
     arguments = sys.argv if args is None else ["", *args]
-    own = rclpy.utilities.remove_ros_args(arguments)[1:]
+    try:
+        own = rclpy.utilities.remove_ros_args(arguments)[1:]
+    except Exception as error:
+        if type(error).__module__.startswith("rclpy"):  # e.g. a malformed --params-file
+            return _complain(node_class, " ".join(str(error).split()))
+        raise
     if own in (["--help"], ["-h"]):
         print(usage(node_class))
         return 0
