@@ -21,7 +21,7 @@ FLOOR = {"errors": 0, "parameters": 0, "geometry": 1, "samples": 1, "sensors": 2
          "estimation": 3, "simulation": 3, "messages": 4, "parameter_file": 4,
          "surface_file": 4, "drivers": 5,
          "nodes": 5, "report": 5, "batch": 5, "graph": 5, "pipeline": 6,
-         "demos": 7, "demos_trajectory": 6, "cli": 7}
+         "demos": 7, "demos_trajectory": 6, "demos_impact": 6, "cli": 7}
 
 
 def imports_of(file):

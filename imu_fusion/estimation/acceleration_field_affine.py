@@ -16,7 +16,7 @@ from imu_fusion.estimation.acceleration_field_kernel import gap_variance
 from imu_fusion.estimation.acceleration_field_rows import (GAP, HELD, MISSING, SATURATED, VALUES,
                                                            put_row, rigid_gradient)
 from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
-                                          right_jacobian)
+                                          right_jacobian, skew)
 
 AO, SQRT_AO = 0, 1
 # Layout of the state vector: quaternion, omega, alpha of this and of the previous sample, a,
@@ -106,6 +106,33 @@ def _grow(cov, dt, phi, cov_alpha):
 
 
 @njit(cache=True)
+def _fit(operator, design, sd, used, reading):
+    """The twelve unknowns (scaled as the design is) and the rms of what they leave over in units
+    of the noise, NaN where nothing can be left over."""
+    fit = np.zeros(12)
+    for c in range(len(sd)):
+        if used[c]:
+            fit += operator[:, c] * reading[c]
+    misfit, count = 0.0, 0
+    for c in range(len(sd)):
+        if used[c]:
+            count += 1
+            misfit += ((reading[c] - np.sum(design[c] * fit)) / sd[c]) ** 2
+    return fit, math.sqrt(misfit / (count - 12)) if count > 12 else math.nan
+
+
+@njit(cache=True)
+def _symmetric_part(fit):
+    """S (3, 3) from the unknowns, whose last six are xx yy zz xy xz yz."""
+    symmetric = np.diag(fit[6:9])
+    for i in range(3):
+        j, k = min((i + 1) % 3, (i + 2) % 3), max((i + 1) % 3, (i + 2) % 3)
+        symmetric[j, k] = fit[11 - i]
+        symmetric[k, j] = fit[11 - i]
+    return symmetric
+
+
+@njit(cache=True)
 def advance(state, cov, last, stamp, readings, design, scale, density, sample_rate,
             reference, gravity, specific_force, method, high_order, max_gap, max_condition,
             values, flags):
@@ -149,22 +176,7 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
         first = state[COUNT] == 0.0
         residual = math.nan
         if determined:
-            fit = np.zeros(12)
-            for c in range(m):
-                if used[c]:
-                    for i in range(12):
-                        fit[i] += operator[i, c] * readings[n, c]
-            misfit = 0.0
-            count = 0
-            for c in range(m):
-                if used[c]:
-                    count += 1
-                    e = readings[n, c]
-                    for i in range(12):
-                        e -= design[c, i] * fit[i]
-                    misfit += (e / sd[c]) ** 2
-            if count > 12:
-                residual = math.sqrt(misfit / (count - 12))
+            fit, residual = _fit(operator, design, sd, used, readings[n])
             fit *= scale
             alpha = fit[3:6].copy()
             cov_alpha = covariance[3:6, 3:6] * np.outer(scale[3:6], scale[3:6])
@@ -173,12 +185,7 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
             fit = np.zeros(12)
             alpha = state[ALPHA:ALPHA + 3].copy()
             cov_alpha = cov[6:9, 6:9].copy()
-        symmetric = np.zeros((3, 3))
-        for i in range(3):
-            j, k = min((i + 1) % 3, (i + 2) % 3), max((i + 1) % 3, (i + 2) % 3)
-            symmetric[i, i] = fit[6 + i]
-            symmetric[j, k] = fit[11 - i]
-            symmetric[k, j] = fit[11 - i]
+        symmetric = _symmetric_part(fit)
         omega = state[RATE:RATE + 3].copy()
         if not first:
             omega = _integrate_rate(state, alpha, dt, high_order)
@@ -194,13 +201,7 @@ def advance(state, cov, last, stamp, readings, design, scale, density, sample_ra
             _set_rate_covariance(cov, omega, covariance, scale)
         if determined:
             acc = fit[0:3].copy()
-            gradient = rigid_gradient(omega, alpha)
-            if full:
-                gradient = symmetric.copy()
-                for i in range(3):
-                    j, k = (i + 1) % 3, (i + 2) % 3
-                    gradient[k, j] += alpha[i]
-                    gradient[j, k] -= alpha[i]
+            gradient = symmetric + skew(alpha) if full else rigid_gradient(omega, alpha)
             cov[12:15, 12:15] = covariance[0:3, 0:3]
             cov[6:9, 6:9] = cov_alpha
         else:

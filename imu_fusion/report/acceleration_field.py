@@ -51,17 +51,23 @@ def _field(data, time):
         rows.append((_place(point), number(magnitude[peak, k], 2), number(time[peak], 3),
                      number(np.sqrt(np.mean(magnitude[:, k] ** 2)), 2),
                      number(np.linalg.norm(force[:, k], axis=1).max(), 2)))
-    at_origin = np.sqrt(np.trace(data.rows["cov_acceleration_world"], axis1=1, axis2=2))
+    stated = [(words, np.sqrt(np.trace(data.rows[name], axis1=1, axis2=2)), color)
+              for words, name, color in (
+                  ("σ of the specific force", "cov_specific_force", fig.SECONDARY),
+                  ("σ of the kinematic acceleration in the world", "cov_acceleration_world",
+                   fig.NEUTRAL))]
     panels = [
         Panel("kinematic in m/s²", tuple(Line(_place(p), time, magnitude[:, k], fig.SERIES[k])
                                          for k, p in enumerate(points[:_POINTS])), from_zero=True),
         Panel("specific force in m/s²", tuple(
             Line(_place(p), time, np.linalg.norm(force[:, k], axis=1), fig.SERIES[k])
             for k, p in enumerate(points[:_POINTS])), from_zero=True),
-        Panel("σ at the origin in m/s²", (Line("σ of the kinematic acceleration", time, at_origin,
-                                               fig.NEUTRAL),), from_zero=True)]
+        Panel("σ at the origin in m/s²", tuple(Line(words, time, sd, color)
+                                               for words, sd, color in stated), from_zero=True)]
     words = ("Magnitudes at the query points. The specific force is what accelerometers there "
-             "would feel and needs no orientation; the kinematic acceleration is without gravity.")
+             "would feel and needs no orientation; the kinematic acceleration is without gravity. As "
+             "a vector in the world it shares the uncertainty of the orientation, which turns it "
+             "and hardly changes its magnitude.")
     return Section("Acceleration field", (
         Numbers((Number("Samples", str(len(time))),
                  Number("Peak acceleration", f"{magnitude.max():.1f} m/s²", "kinematic, all points"),
@@ -75,7 +81,8 @@ def _field(data, time):
         Figure(field_picture(data, time, magnitude[:, 0]),
                "The kinematic acceleration of points of the body, in body axes, around the greatest "
                "magnitude at the first query point. The slider moves through time; all arrows have "
-               "one scale. The straight line through the origin is the angular velocity.",
+               "one scale and a dot as their head. The line from the origin without a head is the "
+               "angular velocity.",
                linked=False)))
 
 
@@ -105,20 +112,20 @@ def field_picture(data, time, magnitude):
         hovertemplate="%{x:.3f}, %{y:.3f}, %{z:.3f} m<extra></extra>"))
     middle = int(np.argmax(magnitude[shown]))
     for k in range(len(shown)):
-        figure.add_traces(_arrows(places, scale * arrows[k], turning[k], 0.12 * reach,
-                                  k == middle))
+        figure.add_traces(_arrows(places, scale * arrows[k], turning[k], k == middle))
     count = len(shown)
     steps = []
     for k in range(count):
-        visible = [True] + [k == other for other in range(count) for _ in range(3)]
+        visible = [True] + [k == other for other in range(count) for _ in range(2)]
         steps.append(dict(method="restyle", args=["visible", visible],
                           label=f"{time[shown[k]]:.3f}"))
     fig.style(figure, 620)
-    limits = [[float(places[:, i].min() - 1.1 * reach), float(places[:, i].max() + 1.1 * reach)]
-              for i in range(3)]
+    middle_place = places.mean(axis=0)
     figure.update_layout(
-        scene=dict(aspectmode="data", **{
-            f"{axis}axis": dict(title=f"{axis} in m", range=limits[i])
+        scene=dict(aspectmode="cube", camera=dict(
+            eye=dict(x=1.25, y=1.25, z=0.85), center=dict(x=0, y=0, z=-0.12)), **{
+            f"{axis}axis": dict(title=f"{axis} in m", range=[
+                float(middle_place[i] - 1.4 * reach), float(middle_place[i] + 1.4 * reach)])
             for i, axis in enumerate("xyz")}),
         legend=dict(orientation="h", x=0, y=1.02, yanchor="bottom"),
         sliders=[dict(active=middle, steps=steps, currentvalue=dict(prefix="time in s: "),
@@ -126,20 +133,15 @@ def field_picture(data, time, magnitude):
     return figure
 
 
-def _arrows(places, vectors, turning, head, visible):
-    """Traces of one instant: shafts, heads, angular velocity."""
+def _arrows(places, vectors, turning, visible):
+    """Traces of one instant: arrows (a dot is the head), angular velocity."""
     tips = places + vectors
-    shafts = np.stack([places, tips, np.full_like(tips, np.nan)], axis=1).reshape(-1, 3)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    unit = head * vectors / np.maximum(length, 1e-12)
-    x, y, z = shafts.T
+    x, y, z = np.stack([places, tips, np.full_like(tips, np.nan)], axis=1).reshape(-1, 3).T
     return [
-        go.Scatter3d(x=x, y=y, z=z, mode="lines", line=dict(color=fig.ESTIMATE, width=5),
+        go.Scatter3d(x=x, y=y, z=z, mode="lines+markers", line=dict(color=fig.ESTIMATE, width=5),
+                     marker=dict(size=[0, 6, 0] * len(places), color=fig.ESTIMATE,
+                                 line=dict(width=0)),
                      name="kinematic acceleration", visible=visible, hoverinfo="skip"),
-        go.Cone(x=tips[:, 0], y=tips[:, 1], z=tips[:, 2], u=unit[:, 0], v=unit[:, 1],
-                w=unit[:, 2], anchor="tip", sizemode="absolute", sizeref=head, showscale=False,
-                colorscale=[[0, fig.ESTIMATE], [1, fig.ESTIMATE]], visible=visible,
-                hoverinfo="skip"),
         go.Scatter3d(x=[0, turning[0]], y=[0, turning[1]], z=[0, turning[2]], mode="lines",
                      line=dict(color=fig.HIGHLIGHT, width=5), name="angular velocity",
                      visible=visible, hoverinfo="skip")]
@@ -149,8 +151,8 @@ def _rates(data, time, clipped):
     rows = data.rows
     panels = []
     for name, unit, values, cov, measured in (
-            ("rate", "rad/s", rows["omega"], rows["cov_omega"], data.gyr),
-            ("angular acc.", "rad/s²", rows["alpha"], rows["cov_alpha"], None)):
+            ("ω", "rad/s", rows["omega"], rows["cov_omega"], data.gyr),
+            ("α", "rad/s²", rows["alpha"], rows["cov_alpha"], None)):
         sd = np.sqrt(np.maximum(np.einsum("nii->ni", cov), 0.0))
         for i, axis in enumerate("xyz"):
             items = [Band("±1σ stated", time, values[:, i] - sd[:, i], values[:, i] + sd[:, i]),

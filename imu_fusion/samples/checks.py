@@ -288,10 +288,12 @@ def check_axes(imu, mag, name):
 
 
 def check_imu(log, name="imu/data_raw"):
-    """All findings about an ImuLog."""
+    """All findings about an ImuLog; that it lacks one of its two parts throughout is none."""
+    parts = [(part, what) for part, what in ((log.gyr, "angular velocity"),
+                                             (log.acc, "acceleration"))
+             if np.isfinite(part).any()] or [(log.acc, "acceleration")]
     return [*check_stamps(log.stamp, name),
-            *check_finite(log.gyr, name, "angular velocity"),
-            *check_finite(log.acc, name, "acceleration"),
+            *(finding for part, what in parts for finding in check_finite(part, name, what)),
             *check_acceleration(log.acc, log.stamp, name),
             *check_held(np.hstack([log.gyr, log.acc]), log.stamp, name),
             *check_saturation(log.gyr, name, "angular velocity", "rad/s"),
