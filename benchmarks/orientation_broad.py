@@ -21,9 +21,8 @@ from imu_fusion.estimation.orientation import OrientationEstimator, OrientationP
 from imu_fusion.samples.logs import ImuLog, MagLog
 
 GYR_DELAY, MAG_DELAY = 0.004, 0.015
-# Rotations from the worlds of the peers into ENU.
+# Madgwick's world is NWU.
 _FROM_NWU = Rotation.from_euler("Z", 90, degrees=True)
-_FROM_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
 # chi2 with 3 degrees of freedom, the probability of 3 sigma of a normal variate.
 _THREE_SIGMA = 14.156
 
@@ -58,8 +57,9 @@ def madgwick(imu, mag):
 
 
 def mahony(imu, mag):
+    """ahrs starts Mahony from an ENU attitude and keeps to it: no rotation of the world."""
     f = ahrs.filters.Mahony(imu.gyr, imu.acc, mag.mag * 1e6, frequency=_frequency(imu))
-    return (_FROM_NWU * Rotation.from_quat(f.Q[:, [1, 2, 3, 0]])).as_quat()
+    return f.Q[:, [1, 2, 3, 0]]
 
 
 def fusion(imu, mag):

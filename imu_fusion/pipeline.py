@@ -1,6 +1,6 @@
 """A recording through real ROS 2 nodes, smoothed and recorded: one call.
 
-    replayer -> smoother, orientation_estimator -> recorder; pipeline calls smoother/smooth
+    replayer -> smoother and other estimators -> recorder; pipeline calls smoother/smooth
 
 Each node is a process of an own ROS domain. The estimates are those of ``batch.process``.
 """

@@ -4,6 +4,7 @@ import re
 
 import pytest
 from click.testing import CliRunner
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imu_fusion import cli
 from imu_fusion.messages.bag import BagWriter, open_bag
@@ -130,3 +131,25 @@ def test_info_repairs_a_truncated_recording(tmp_path):
     assert result.exit_code == 0 and "not closed properly" in result.output
     with open_bag(tmp_path / "clean") as reader:
         assert not reader.warnings and reader.count > 0
+
+
+def test_topics_of_unknown_types_are_left_alone_and_kept_by_convert(tmp_path):
+    """A recording of somebody's robot holds types that nobody has installed here."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    types.register(get_types_from_msg("float64 torque\nstring joint", "robot_msgs/msg/Joint"))
+    joint = types.types["robot_msgs/msg/Joint"](torque=1.5, joint="knee")
+    with BagWriter(tmp_path / "bag", typestore=types) as writer:
+        for i in range(300):
+            stamp = START + i * STEP
+            writer.write("/joint", "robot_msgs/msg/Joint",
+                         bytes(types.serialize_cdr(joint, "robot_msgs/msg/Joint")), stamp)
+            writer.write("/imu/data_raw", IMU.msgtype,
+                         imu_message(stamp, "imu_link", [0, 0, 0], [0, 0, 9.81]), stamp)
+    bag = str(tmp_path / "bag")
+    assert "robot_msgs/Joint" in call("info", bag).output
+    assert call("process", bag, str(tmp_path / "out")).exit_code == 0
+    assert call("convert", bag, str(tmp_path / "copy")).exit_code == 0
+    with open_bag(tmp_path / "copy") as reader:
+        assert reader.topics["/joint"].count == 300
+        *_, cdr = next(reader.messages(["/joint"]))
+        assert reader.typestore.deserialize_cdr(cdr, "robot_msgs/msg/Joint").joint == "knee"

@@ -15,7 +15,6 @@ from imu_fusion.messages.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
-from imu_fusion.parameter_file import parameters_for
 from imu_fusion.report.acceleration_field import field_sections
 from imu_fusion.report.field_data import read_field
 from imu_fusion.report.figures import intervals
@@ -107,8 +106,7 @@ def smooth_recording(contents, params_file=None):
     """
     if not set(smoothing.REQUIRED) <= contents.logs.keys():
         return None, None
-    params, _ = parameters_for([smoothing.SmoothingParams, smoothing.SmootherNodeParams],
-                               "smoother", params_file)
+    _, (params,) = stages()["smoother"].prepare(params_file)
     try:
         result = smoothing.smooth(params, contents.samples(smoothing.INPUTS))
     except (EstimationError, SampleError) as error:
