@@ -235,6 +235,7 @@ def _impacts(data, origin):
     for key, words, factor, unit in _METRICS:
         rows.append((words, unit, *(number(i[key] * factor, 3) if key in i else "–"
                                     for i in columns)))
+    rows.append(("recorded to its end", "", *("yes" if i["complete"] else "no" for i in columns)))
     rows.append(("samples with saturation", "", *(str(i["saturated_samples"]) for i in columns)))
     refused = sorted({i["refused"] for i in columns if "refused" in i})
     first = columns[0]
