@@ -90,8 +90,8 @@ def phyphox(folder):
     stamp, gyr = _phyphox_sensor(folder / "Gyroscope.csv", {"rad/s": 1.0})
     step = np.diff(acc_stamp)
     if len(step) == 0 or (step <= 0).any():
-        raise SampleError(f"{folder / 'Accelerometer.csv'}: times do not increase after sample "
-                          f"{1 + int(np.argmax(np.r_[step <= 0, True]))}")
+        raise SampleError(f"{folder / 'Accelerometer.csv'}, line "
+                          f"{2 + int(np.argmax(np.r_[step <= 0, True]))}: no later time follows")
     keep, acc = _interpolated(stamp, acc_stamp, acc)
     if not keep.any():
         raise SampleError(f"{folder}: Accelerometer.csv and Gyroscope.csv have no time in common")
@@ -251,15 +251,13 @@ def _table(path):
 def _index(path, names, wanted, units):
     """(place, factor to SI) of the column 'wanted (unit)' or 'wanted[unit]'."""
     found = None
+    # Newer exports write 'Acceleration x (m/s^2)'.
+    prefix = "(?:.* )?" if len(wanted) == 1 else ""
     for place, name in enumerate(names):
-        match = re.fullmatch(r"(.*?)\s*[(\[](.*)[)\]]", name.strip())
-        # Newer exports write 'Acceleration x (m/s^2)'.
-        label = match and match[1].lower()
-        if label == wanted.lower() or (len(wanted) == 1 and label
-                                       and label.endswith(" " + wanted.lower())):
-            if match[2] in units:
-                return place, units[match[2]]
-            found = match[2]
+        match = re.fullmatch(prefix + wanted + r"\s*[(\[](.*)[)\]]", name.strip(), re.IGNORECASE)
+        if match and match[1] in units:
+            return place, units[match[1]]
+        found = match[1] if match else found
     if found is not None:
         raise SampleError(f"{path}: column '{wanted}' is in '{found}', expected "
                           + " or ".join(units))

@@ -131,6 +131,8 @@ GYROSCOPE = '"Time (s)","X (rad/s)","Y (rad/s)","Z (rad/s)"\n'
     ({"Gyroscope": GYROSCOPE}, "Gyroscope.csv: no rows"),
     ({"Gyroscope": GYROSCOPE.replace(",", ";") + "0,02;0;0;0\n"}, "Gyroscope.csv: no column"),
     ({"Gyroscope": GYROSCOPE + "9,0,0,0\n"}, "no time in common"),
+    ({"Accelerometer": GYROSCOPE.replace("rad/s", "m/s^2") + "1,0,0,9\n2,0,0,9\n2,0,0,9\n"},
+     "Accelerometer.csv, line 3: no later time follows"),
     ({"Location": LOCATION + "1,4300.5,1.4,157,-1,-1,500,300\n"},
      "Location.csv, line 2: latitude 4300.5"),
 ])
