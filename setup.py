@@ -16,6 +16,7 @@ ros = ["ros-jazzy-rclpy>=7.1,<8", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-
 report = ["plotly>=5.15"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
+oracles = ["pyisomme>=1"]
 test = ["pytest>=7.4", "hypothesis>=6", "colcon-common-extensions", *report, *terrain]
 
 nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
@@ -47,7 +48,8 @@ setup(
         "rosbags>=0.10", "mcap>=1.1", "zstandard", "lz4",
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
-    extras_require={"ros": ros, "report": report, "terrain": terrain, "peers": peers, "test": test},
+    extras_require={"ros": ros, "report": report, "terrain": terrain, "peers": peers,
+                    "oracles": oracles, "test": test},
     entry_points={"console_scripts": [
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
