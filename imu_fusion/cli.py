@@ -171,6 +171,8 @@ def _number(value, form):
 def convert(source, out, topics, description, remap, overwrite):
     """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
 
+    SOURCE may also be the folder of a phyphox CSV export (Accelerometer.csv, Gyroscope.csv, ...)
+    or an AvaNode log (.txt); they become imu/data_raw, imu/mag, fix and fix_velocity.
     With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With --csv
     SOURCE is a table, and OUT.yaml becomes the parameter file that process takes.
     """
@@ -180,6 +182,15 @@ def convert(source, out, topics, description, remap, overwrite):
         from imu_fusion.messages.csv_import import import_csv
         parameter_file, count = import_csv(source, description, out, overwrite)
         click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
+        return
+    from imu_fusion.messages.importers import import_files, importer_of
+    importer = importer_of(source)
+    if importer is not None:
+        if topics or remap:
+            raise click.UsageError("--topic and --remap are for recordings, not for other files")
+        counts = import_files(importer, source, out, overwrite)
+        click.echo(f"written: {out} with "
+                   + ", ".join(f"{n} of {topic}" for topic, n in sorted(counts.items())))
         return
     from imu_fusion.messages.bag import BagWriter, open_bag
     names = {other: name for name, other in _remaps(remap).items()}

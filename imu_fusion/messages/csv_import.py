@@ -227,7 +227,7 @@ def _read_table(source, params, columns):
             raise ParameterError(
                 f"{source}: {'no' if name not in names else 'more than one'} column '{name}'; "
                 f"there are: {', '.join(names)}")
-    table = {name: np.array([_number(source, number, name, row, names.index(name))
+    table = {name: np.array([read_number(source, number, name, row, names.index(name))
                              for number, row in rows]) for name in columns}
     if params.time__column is None:
         since = np.round(np.arange(len(rows)) * (NANOSECONDS / params.time__rate))
@@ -246,7 +246,8 @@ def _cell(source, line, name, row, place):
     return row[place].strip()
 
 
-def _number(source, line, name, row, place):
+def read_number(source, line, name, row, place):
+    """The number in cell ``place`` of a row, NaN if empty; SampleError names what it is not."""
     text = _cell(source, line, name, row, place)
     try:
         return float(text) if text else np.nan
