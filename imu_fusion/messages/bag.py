@@ -25,6 +25,8 @@ from imu_fusion.errors import BagError, TopicError
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 
+# What we write into the directory of a recording beside its files.
+_BESIDE = ("metadata.yaml", "results.json", "report.html")
 _UNLIMITED = {"sec": 2147483647, "nsec": 4294967295}
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
@@ -332,7 +334,7 @@ class BagWriter:
                 if not self.directory.is_dir():
                     raise BagError(f"{self.directory}: is a file, not a directory to record into")
                 present = sorted(p.name for p in self.directory.iterdir())
-                ours = all(p == "metadata.yaml" or p.endswith((".mcap", ".db3", ".json")) for p in present)
+                ours = all(p in _BESIDE or p.endswith((".mcap", ".db3")) for p in present)
                 if present and not (overwrite and ours):
                     raise BagError(f"{self.directory}: exists and is not empty; choose another "
                                    "directory" + ("" if ours else " (it holds other files)"))
