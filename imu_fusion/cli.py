@@ -125,7 +125,8 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
     if with_report:
         from imu_fusion.report.recording import write_recording_report
         path = Path(out) / "report.html"
-        write_recording_report(out, None, path, params_file)
+        # BAG keeps the times of its messages, OUT has those of the replay, but our names.
+        write_recording_report(out if remap else bag, out, path, params_file)
         click.echo(f"written: {path}")
 
 

@@ -38,7 +38,9 @@ def overview_section(topics, origin):
                             "axis stands at a limit."))
     if ranges:
         blocks.append(Table(("topic", "quantity", "least", "greatest", "unit"), tuple(ranges)))
-    panels = [panel for t in topics[:_PANELS] if t.stamped for panel in _intervals(t, origin)]
+    # Samples only: diagnostics of a replay carry the time of the replay.
+    drawn = [t for t in topics if t.stamped and t.log is not None]
+    panels = [panel for t in drawn[:_PANELS] for panel in _intervals(t, origin)]
     if panels:
         blocks.append(Figure(
             time_figure(panels, panel_height=105),
