@@ -29,7 +29,7 @@ def orientation(out, console):
         graph.start("replayer", show=True, bag=str(bag), rate=0.0,
                     wait_for_nodes=("recorder", "orientation_estimator"))
         graph.wait("replayer", 300)
-        graph.wait("recorder", 60)
+        graph.finish("recorder", 30.0)
     elapsed = time.monotonic() - started
 
     with open_bag(bag) as played, open_bag(recording) as recorded:

@@ -26,7 +26,7 @@ def impact(out, console):
         graph.start("replayer", show=True, bag=str(bag), rate=0.0,
                     wait_for_nodes=("recorder", "acceleration_field_estimator"))
         graph.wait("replayer", 300)
-        graph.wait("recorder", 60)
+        graph.finish("recorder", 30.0)
     values = load(preset)["acceleration_field_estimator"]
     limit = values["gyroscope"]["range"]
     preset_smoothed = out / "smoothed.yaml"

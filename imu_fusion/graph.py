@@ -116,6 +116,30 @@ class Graph:
             raise GraphError(f"node {node} ended with code {self._processes[node].returncode}: "
                              f"{self._last_words(node)}")
 
+    def finish(self, node, patience, progress=lambda: None):
+        """Wait for the end of a node; ask it to end (as Ctrl-C does) when nothing moves any more.
+
+        Args:
+            patience: seconds in which ``progress()`` may stay the same.
+
+        Returns:
+            Whether the node ended by itself.
+
+        Raises:
+            GraphError: as :meth:`wait`.
+        """
+        process, seen, since = self._processes[node], progress(), time.monotonic()
+        while process.poll() is None and time.monotonic() - since < patience:
+            time.sleep(0.05)
+            now = progress()
+            if now != seen:
+                seen, since = now, time.monotonic()
+        by_itself = process.poll() is not None
+        if not by_itself:
+            process.send_signal(signal.SIGINT)
+        self.wait(node, 15.0)
+        return by_itself
+
     def log(self, node):
         """What a node has printed so far."""
         return (self._logs / f"{node}.log").read_text(errors="replace")

@@ -72,5 +72,8 @@ def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, log
                     wait_for_subscribers=0, wait_for_nodes=("recorder", "pipeline", *estimators))
         graph.wait("replayer", _PATIENCE)
         graph.wait("pipeline", _PATIENCE)
-        graph.wait("recorder", 60.0)
+        # Rarely the recorder does not notice the end of the smoother's session (why is not
+        # understood): then its file has stopped growing.
+        graph.finish("recorder", 15.0, lambda: sum(
+            file.stat().st_size for file in Path(out).glob("*.mcap")))
         return graph.domain

@@ -4,11 +4,13 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from sensor_msgs.msg import Imu
 
+from imu_fusion.graph import Graph
 from imu_fusion.messages.bag import open_bag
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
@@ -113,3 +115,15 @@ def test_help_lists_the_parameters_and_wrong_arguments_are_refused():
     done = subprocess.run([SCRIPTS / "replayer", "my.bag"], env=ENVIRONMENT,
                           capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and "unexpected argument 'my.bag'" in done.stderr
+
+
+def test_a_graph_asks_a_node_to_end_that_does_not_by_itself(tmp_path):
+    """A recorder without a session never ends; asked to, it closes its recording."""
+    with Graph(tmp_path / "logs") as graph:
+        graph.start("recorder", out=str(tmp_path / "bag"))
+        deadline = time.monotonic() + 30.0
+        while not (tmp_path / "bag" / "bag_0.mcap").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert graph.finish("recorder", 0.5) is False
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
