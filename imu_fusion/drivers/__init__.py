@@ -1,1 +1,0 @@
-"""Live sources: bytes to samples."""
