@@ -15,7 +15,8 @@ from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.messages.bag import TYPES
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.messages.streams import EstimatorNodeParams
+from imu_fusion.parameters import param
 from imu_fusion.samples import checks
 from imu_fusion.samples.guard import Guard, Verdict
 from imu_fusion.surface_file import load_surface
@@ -44,12 +45,9 @@ class SmoothingParams(SmootherParams):
 
 
 @dataclass(frozen=True)
-class SmootherNodeParams(Parameters):
+class SmootherNodeParams(EstimatorNodeParams):
     """What concerns the node, not the trajectory."""
 
-    qos: str = param("sensor_data", choices=("sensor_data", "reliable"),
-                     doc="Live subscriptions: sensor_data takes any publisher; reliable asks for "
-                         "repeats of what was lost. In a replay they are always reliable.")
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
                                     "taken, and smoothing is refused until smoother/clear.")
