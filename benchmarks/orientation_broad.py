@@ -153,7 +153,7 @@ def main():
                           ("fusion, smoothed, use_acc false",
                            dict(use_acc=False, mode="smoothed")),
                           ("fusion, causal", {}), ("fusion, smoothed", dict(mode="smoothed"))]:
-        delays = dict(gyr_delay=GYR_DELAY)
+        delays = dict(gyro_delay=GYR_DELAY)
         if name.startswith("gyro_mag"):
             delays["mag_delay"] = MAG_DELAY
         plain, _ = mine(**changes)

@@ -66,7 +66,7 @@ def main():
                 results.setdefault(peer, []).append(
                     (*broad_errors(quat, ref, mask), rate_rmse_deg(imu.gyr, truth, clipped)))
             for mode in ("causal", "smoothed"):
-                out = OrientationEstimator(OrientationParams(mode=mode, gyr_delay=delay)).run(
+                out = OrientationEstimator(OrientationParams(mode=mode, gyro_delay=delay)).run(
                     imu, mag)
                 results.setdefault(f"fusion, {mode}", []).append(
                     (*broad_errors(out["quat_world_imu"], ref, mask),

@@ -19,8 +19,8 @@ from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
 # receiver differences positions for its velocity, so this comes late by half a period
 # (0.125 s, found by correlation and by the state).
 PARAMS = SmootherParams(
-    gyr_noise_density=3e-3, acc_noise_density=3e-2, gyr_bias_sd=0.02, acc_bias_sd=1.0,
-    gyr_bias_walk=1e-5, acc_bias_walk=1e-3, velocity_sd=(0.1, 0.1, 0.1),
+    gyro_noise_density=3e-3, acc_noise_density=3e-2, gyro_bias_sd=0.02, acc_bias_sd=1.0,
+    gyro_bias_walk=1e-5, acc_bias_walk=1e-3, velocity_sd=(0.1, 0.1, 0.1),
     gnss_time_offset_sd=0.2, velocity_time_offset_sd=0.2, gnss_lever_arm=(0.0, 0.05, 0.0))
 LENGTH, COUNT = 15.0, 11
 

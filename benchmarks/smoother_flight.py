@@ -16,7 +16,7 @@ from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 # some 0.2 s. The magnetometer sits beside the motor's currents: taken at 2 uT it contradicts
 # Imu and GNSS (velocity innovations of 3 to 6 standard deviations), so it is taken at 20 uT.
 PARAMS = SmootherParams(
-    gyr_noise_density=1e-2, acc_noise_density=0.2, gyr_bias_sd=0.2, acc_bias_sd=1.0,
+    gyro_noise_density=1e-2, acc_noise_density=0.2, gyro_bias_sd=0.2, acc_bias_sd=1.0,
     fix_sd=(1.0, 1.0, 1.5), velocity_sd=(0.3, 0.3, 0.5), gnss_time_offset_sd=0.3, mag_sd=20e-6)
 
 

@@ -14,8 +14,8 @@ from imu_fusion.messages.bag import open_bag
 from imu_fusion.messages.convert import read_log
 from imu_fusion.surface_file import surface_from_mapping
 
-BASE = SmootherParams(gyr_noise_density=5e-3, acc_noise_density=0.1, acc_bias_sd=0.5,
-                      gyr_bias_sd=0.05, speed_sd=2.0)
+BASE = SmootherParams(gyro_noise_density=5e-3, acc_noise_density=0.1, acc_bias_sd=0.5,
+                      gyro_bias_sd=0.05, speed_sd=2.0)
 # Fixes wander by metres over minutes and scatter by some 0.3 m from one to the next.
 WANDER = BASE.replace(fix_sd=(0.5, 0.5, 1.0), gnss_position_error_sd=(3.0, 3.0, 15.0),
                       gnss_position_error_tau=100.0)

@@ -91,7 +91,7 @@ def main():
     row("events given 0.15 s early", events=shifted(-0.15))
     row("events given 0.15 s late", events=shifted(0.15))
     row("gyroscope clipped at 2.5 rad/s", phone=PhoneErrors(gyr_range=2.5),
-        params=base.replace(gyr_range=2.5))
+        params=base.replace(gyro_range=2.5))
     start = jump.t_takeoff + 1.0
     row("no Imu for 0.5 s in flight", change=without_imu(start, start + 0.5))
     row("no GNSS for 1 s in flight", outages=((start, start + 1.0),))

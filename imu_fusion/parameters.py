@@ -6,7 +6,7 @@ README are all derived from it.
 
     @dataclass(frozen=True)
     class OrientationParams(Parameters):
-        gyr_noise_density: float = param(1e-3, unit="rad/s/sqrt(Hz)", low=0, doc="...")
+        gyro_noise_density: float = param(1e-3, unit="rad/s/sqrt(Hz)", low=0, doc="...")
 
 A field whose type allows ``None`` is *unset* by default: the estimator finds
 the value itself.

@@ -52,13 +52,13 @@ class OrientationParams(Parameters):
                                   doc="Uncertainty of the heading that the first interval shows.")
     alignment_duration: float = param(1.0, unit="s", low=0.05, high=60,
                                       doc="First interval, from which the orientation starts.")
-    gyr_noise_density: float = param(3e-4, unit="rad/s/sqrt(Hz)", low=1e-9, high=1,
+    gyro_noise_density: float = param(3e-4, unit="rad/s/sqrt(Hz)", low=1e-9, high=1,
                                      doc="Gyroscope noise.")
-    gyr_bias_sd: float = param(0.01, unit="rad/s", low=0, high=1,
+    gyro_bias_sd: float = param(0.01, unit="rad/s", low=0, high=1,
                                doc="Standard deviation of a bias that no rest has shown.")
-    gyr_bias_walk: float = param(2e-5, unit="rad/s/sqrt(s)", low=0, high=1,
+    gyro_bias_walk: float = param(2e-5, unit="rad/s/sqrt(s)", low=0, high=1,
                                  doc="Random walk of the gyroscope bias.")
-    gyr_range: tuple[float, ...] | None = param(
+    gyro_range: tuple[float, ...] | None = param(
         None, unit="rad/s", low=1e-3, length=(1, 3),
         doc="Largest rate the gyroscope reports, one value or one per axis; unset: found "
             "from flat tops by fusion.")
@@ -81,7 +81,7 @@ class OrientationParams(Parameters):
                             doc="gyro_mag: wander of the local field, relative to its norm.")
     field_time: float = param(20.0, unit="s", low=1e-3,
                               doc="gyro_mag: time constant of that wander.")
-    gyr_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
+    gyro_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
                              doc="How late rates and specific forces are stamped.")
     mag_delay: float | None = param(
         None, unit="s", low=-0.1, high=0.1,
@@ -90,7 +90,7 @@ class OrientationParams(Parameters):
     mag_delay_sd: float = param(0.01, unit="s", low=0, high=0.1,
                                 doc="Standard deviation of a magnetometer delay that is not given.")
     block: float = param(0.02, unit="s", low=1e-3, high=1, doc="Time between corrections.")
-    gyr_scale_sd: float = param(0.005, low=0, high=0.2,
+    gyro_scale_sd: float = param(0.005, low=0, high=0.2,
                                 doc="Standard deviation of gyroscope scale and misalignment.")
     estimate_bias: bool = param(True, doc="Whether gyroscope bias and scale are estimated.",
                                 read_only=False)
@@ -297,7 +297,7 @@ class OrientationEstimator:
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
             **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", bias)},
-            gyr_delay=self.params.gyr_delay, mag_delay=self.params.gyr_delay + float(x[st.LAG]))
+            gyro_delay=self.params.gyro_delay, mag_delay=self.params.gyro_delay + float(x[st.LAG]))
 
     def _step(self, stamp):
         if self._next == _CHUNK:
@@ -366,9 +366,9 @@ class OrientationEstimator:
         self._alignment = align(
             stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
             declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
-            gyr_density=p.gyr_noise_density, gyr_bias_sd=p.gyr_bias_sd,
+            gyr_density=p.gyro_noise_density, gyr_bias_sd=p.gyro_bias_sd,
             acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
-        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyr_delay
+        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyro_delay
         self._kernel.initialise(self._x, self._k, par, self._alignment)
         self._k[st.ALIGN_UNTIL] = stamps[-1]
 
@@ -380,19 +380,19 @@ class OrientationEstimator:
 
     def _pack(self, p):
         par = np.zeros(self._kernel.P_SIZE)
-        par[st.P_GYR_DELAY] = p.gyr_delay
+        par[st.P_GYR_DELAY] = p.gyro_delay
         par[st.P_DECLINATION] = math.radians(p.declination_deg or 0.0)
         par[st.P_MAX_LAG] = p.max_mag_lag
         par[st.P_MAX_GAP] = p.max_gap
-        par[st.P_GYR_DENSITY] = p.gyr_noise_density
+        par[st.P_GYR_DENSITY] = p.gyro_noise_density
         par[st.P_ACC_DENSITY] = p.acc_noise_density
         par[st.P_ACC_BIAS_SD] = p.acc_bias_sd
         par[st.P_MAG_SD] = p.mag_noise_sd
         par[st.P_RELIABILITY] = p.mag_reliability
         par[st.P_GAP_RATE_SD] = p.gap_rate_sd
-        par[st.P_BIAS_WALK] = p.gyr_bias_walk
+        par[st.P_BIAS_WALK] = p.gyro_bias_walk
         par[st.P_AXES_SD] = p.axes_sd
-        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyr_range, np.nan)
+        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyro_range, np.nan)
         par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
         par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset
         par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9] = p.mag_matrix

@@ -55,7 +55,7 @@ def pack(par, p):
         p.block, p.velocity_walk, p.velocity_sd, p.velocity_time, p.position_sd,
         p.position_time, p.local_field_sd, p.local_field_time, p.field_walk, p.mag_sd,
         p.norm_deviation_factor, p.rest_rate, p.rest_force, p.rest_time, p.rest_rate_sd,
-        p.saturation_walk, p.estimate_bias, p.gyr_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
+        p.saturation_walk, p.estimate_bias, p.gyro_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
         p.mag_delay_sd if p.mag_delay is None else 0.0, p.heading_anchor == "field",
         math.radians(p.heading_sd_deg), p.use_acc)
 

@@ -174,5 +174,5 @@ def test_rows_have_the_promised_layout(params, recording):
 
 
 def test_parameters_are_refused_by_name():
-    with pytest.raises(ParameterError, match="gyr_range"):
-        OrientationParams(gyr_range=(1.0, 2.0))
+    with pytest.raises(ParameterError, match="gyro_range"):
+        OrientationParams(gyro_range=(1.0, 2.0))

@@ -211,7 +211,7 @@ def test_bursts_beyond_the_limit_are_solved():
     after = np.sqrt(((result["smoothed"]["gyr"] - rates)[clipped] ** 2).mean())
     assert after < 0.2 * before
     # Beside the same filter that takes clipped rates for true ones.
-    blind = OrientationEstimator(OrientationParams(gyr_range=(1e3,))).run(imu, mag)
+    blind = OrientationEstimator(OrientationParams(gyro_range=(1e3,))).run(imu, mag)
     assert rmse_deg(result["causal"], truth) < 0.4 * rmse_deg(blind, truth)
     assert rmse_deg(result["smoothed"], truth) < 0.4 * rmse_deg(result["causal"], truth)
 

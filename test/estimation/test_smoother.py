@@ -133,7 +133,7 @@ def test_clipped_gyroscope_is_bridged(jump):
     clipped = record(jump, np.random.default_rng(8), PhoneErrors(gyr_range=2.0))
     lost = np.abs(clipped.imu.gyr).max(axis=1) >= 1.999
     assert lost.sum() > 5
-    r = Smoother(SmootherParams(gyr_range=2.0), jump.hill).run(
+    r = Smoother(SmootherParams(gyro_range=2.0), jump.hill).run(
         clipped.imu, clipped.mag, clipped.fix, clipped.velocity)
     check(r, clipped, jump.hill, BOUNDS * [1, 1, 1, 1, 1, 1, 3, 3, 3])
     error = r.samples["gyr"][lost] - clipped.motion.omega_imu[lost]

@@ -141,9 +141,9 @@ def test_report_from_the_command_line_is_bounded_and_refusals_are_told(tmp_path)
     assert {"Trajectory", "Jump", "Orientation", "Error against the reference"} <= set(headings)
     assert out.stat().st_size < 11e6
     params = tmp_path / "p.yaml"
-    params.write_text("smoother: {ros__parameters: {gyr_noise_density: 1.0e-9}}")
+    params.write_text("smoother: {ros__parameters: {gyro_noise_density: 1.0e-9}}")
     result = CliRunner().invoke(cli.cli, ["report", str(BAG), "--params-file", str(params)])
-    assert result.exit_code == 1 and "gyr_noise_density" in result.output
+    assert result.exit_code == 1 and "gyro_noise_density" in result.output
 
 
 def test_what_cannot_be_smoothed_is_told_in_the_report(tmp_path):

@@ -214,7 +214,7 @@ class ExtendedRts:
         for k in range(n):
             if k:
                 # The density, as the standard deviation of one sample held over the step.
-                q = np.repeat([p.gyr_noise_density ** 2, p.acc_noise_density ** 2],
+                q = np.repeat([p.gyro_noise_density ** 2, p.acc_noise_density ** 2],
                               3) / steps[k - 1]
                 x, cov, transition[k - 1] = self._predict(x, cov, inputs[k - 1], inputs[k],
                                                           steps[k - 1], q)

@@ -83,7 +83,7 @@ def prepare_imu(imu, params):
     sides = []
     clipped_gyr = np.zeros(len(imu), bool)
     for values, limit, density, unknown in (
-            (imu.gyr, params.gyr_range, params.gyr_noise_density, params.unknown_gyr_density),
+            (imu.gyr, params.gyro_range, params.gyro_noise_density, params.unknown_gyro_density),
             (imu.acc, params.acc_range, params.acc_noise_density, params.unknown_acc_density)):
         lost = np.repeat(~recorded[:, None], 3, axis=1)
         if limit > 0.0:

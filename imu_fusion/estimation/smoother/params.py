@@ -13,27 +13,27 @@ class SmootherParams(Parameters):
     method: str = param("iterated", doc="Estimator: the iterated smoother or the paper's",
                         choices=("iterated", "extended_rts"))
 
-    gyr_noise_density: float = param(1.75e-3, doc="Gyroscope white noise", unit="rad/s/sqrt(Hz)",
+    gyro_noise_density: float = param(1.75e-3, doc="Gyroscope white noise", unit="rad/s/sqrt(Hz)",
                                      low=1e-7, high=1.0)
     acc_noise_density: float = param(1e-2, doc="Accelerometer white noise, with the motion that "
                                      "the sampling cannot follow", unit="m/s^2/sqrt(Hz)",
                                      low=1e-6, high=10.0)
-    gyr_bias_sd: float = param(0.0873, doc="Initial gyroscope bias", unit="rad/s", low=1e-6)
+    gyro_bias_sd: float = param(0.0873, doc="Initial gyroscope bias", unit="rad/s", low=1e-6)
     acc_bias_sd: float = param(0.2, doc="Initial accelerometer bias", unit="m/s^2", low=1e-6)
-    gyr_bias_walk: float = param(0.0, doc="Random walk of the gyroscope bias",
+    gyro_bias_walk: float = param(0.0, doc="Random walk of the gyroscope bias",
                                  unit="rad/s/sqrt(s)", low=0.0)
     acc_bias_walk: float = param(0.0, doc="Random walk of the accelerometer bias",
                                  unit="m/s^2/sqrt(s)", low=0.0)
-    gyr_scale_sd: float = param(0.0, doc="Gyroscope scale errors as states", low=0.0, high=0.5)
+    gyro_scale_sd: float = param(0.0, doc="Gyroscope scale errors as states", low=0.0, high=0.5)
     acc_matrix_sd: float = param(0.0, doc="Accelerometer scale errors and misalignments (nine, "
                                  "Winkler's C) as states", low=0.0, high=0.5)
-    gyr_range: float = param(0.0, doc="Range of the gyroscope, beyond which it is clipped; 0: "
+    gyro_range: float = param(0.0, doc="Range of the gyroscope, beyond which it is clipped; 0: "
                              "unlimited", unit="rad/s", low=0.0)
     acc_range: float = param(0.0, doc="Range of the accelerometer; 0: unlimited", unit="m/s^2",
                              low=0.0)
     max_gap: float = param(0.1, doc="Longest step between Imu samples that counts as sampled; "
                            "longer ones are bridged with unknown motion", unit="s", low=1e-3)
-    unknown_gyr_density: float = param(0.1, doc="Noise of the rate where it was clipped or not "
+    unknown_gyro_density: float = param(0.1, doc="Noise of the rate where it was clipped or not "
                                        "recorded", unit="rad/s/sqrt(Hz)", low=1e-3)
     unknown_acc_density: float = param(2.0, doc="Noise of the force where it was clipped or not "
                                        "recorded", unit="m/s^2/sqrt(Hz)", low=1e-3)

@@ -78,15 +78,15 @@ class Smoother:
                   "gnss_position_error": wander if wander.any() else 0,
                   "gnss_time_offset": [p.gnss_time_offset_sd],
                   "velocity_time_offset": [p.velocity_time_offset_sd], "acc_matrix": [p.acc_matrix_sd] * 9,
-                  "gyr_scale": [p.gyr_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
+                  "gyr_scale": [p.gyro_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
                   "body_height": [p.body_height_sd]}
         present = {name: sd for name, sd in blocks.items() if np.any(sd)}
         layout, size = model.make_layout(present)
         sd = np.concatenate([[p.position_sd] * 3, [p.speed_sd] * 3, [p.attitude_sd] * 3,
-                             [p.gyr_bias_sd] * 3, [p.acc_bias_sd] * 3,
+                             [p.gyro_bias_sd] * 3, [p.acc_bias_sd] * 3,
                              *(present[name] for name, _ in model.BLOCKS if name in present)])
         decay, walk = np.zeros(size), np.zeros(size)
-        walk[model.GYR_BIAS:model.GYR_BIAS + 3] = p.gyr_bias_walk ** 2
+        walk[model.GYR_BIAS:model.GYR_BIAS + 3] = p.gyro_bias_walk ** 2
         walk[model.ACC_BIAS:model.ACC_BIAS + 3] = p.acc_bias_walk ** 2
         i = layout[model.GNSS_ERROR]
         if i >= 0:
