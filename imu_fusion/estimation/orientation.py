@@ -14,7 +14,7 @@ from imu_fusion.errors import EstimationError, ParameterError, SampleError
 from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
 from imu_fusion.estimation import orientation_state as st
-from imu_fusion.estimation.orientation_alignment import align
+from imu_fusion.estimation.orientation_alignment import align, usable_mags
 from imu_fusion.estimation.orientation_smoother import smooth
 from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
 from imu_fusion.parameters import Parameters, param
@@ -69,6 +69,10 @@ class OrientationParams(Parameters):
     axes_sd: float = param(0.005, unit="rad", low=0, high=1,
                            doc="Uncertainty of the sensor's axes in its case, part of the "
                                "attitude's covariance.")
+    mag_range: tuple[float, ...] | None = param(
+        None, unit="T", low=1e-6, length=(1, 3),
+        doc="Largest field the magnetometer reports, one value or one per axis, before mag_offset "
+            "and mag_matrix; unset: found from flat tops.")
     mag_noise_sd: float = param(1e-6, unit="T", low=1e-12, high=1e-4,
                                 doc="Noise of one magnetometer sample.")
     mag_offset: tuple[float, ...] = param((0.0, 0.0, 0.0), unit="T", length=3,
@@ -206,7 +210,7 @@ class OrientationEstimator:
         """Take one magnetometer sample: int ns, (3,) tesla. Returns rows like add_imu."""
         self._mag[:] = mag
         if self._alignment is None:
-            if np.isfinite(self._mag).all():
+            if st.is_mag_sample(self._mag):
                 self._waiting.append((stamp, self._mag.copy()))
             else:
                 self._k[st.MAG_REJECTED] += 1
@@ -284,7 +288,8 @@ class OrientationEstimator:
             method=self.params.method, aligned=a is not None, imu_used=int(k[st.IMU_USED]),
             imu_rejected=int(k[st.IMU_REJECTED]), mag_used=int(k[st.MAG_USED]),
             mag_rejected=int(k[st.MAG_REJECTED]), mag_late=int(k[st.MAG_LATE]),
-            mag_disturbed=int(k[st.MAG_DISTURBED]), gaps=int(k[st.GAPS]),
+            mag_disturbed=int(k[st.MAG_DISTURBED]),
+            mag_saturated=int(k[st.MAG_SATURATED]), gaps=int(k[st.GAPS]),
             saturated=int(k[st.SATURATED]))
         if a is None:
             return counts
@@ -317,7 +322,7 @@ class OrientationEstimator:
 
     def _wait_imu(self, stamp):
         last = next((s for s, v in reversed(self._waiting) if len(v) == 6), None)
-        if not np.isfinite(self._sample).all() or (last is not None and stamp <= last):
+        if not st.is_imu_sample(self._sample) or (last is not None and stamp <= last):
             self._k[st.IMU_REJECTED] += 1
             return self._chunk[:0]
         self._waiting.append((stamp, self._sample.copy()))
@@ -331,14 +336,15 @@ class OrientationEstimator:
         if self._alignment is not None or self._waiting:
             raise EstimationError("mode 'smoothed' needs the whole recording in one run(); "
                                   "reset() first, or use mode 'causal'")
-        good = np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1)
+        samples = np.hstack([imu.gyr, imu.acc])
+        good = np.array([st.is_imu_sample(sample) for sample in samples], dtype=bool)
         if not good.any():
             return self._chunk[:0]
         origin = imu.stamp[np.argmax(good)]
         end = origin + int(self.params.alignment_duration * 1e9)
         first = good & (imu.stamp <= end)
-        first_mag = np.isfinite(mags).all(axis=1) & (mag_stamps <= end)
-        samples = np.hstack([imu.gyr, imu.acc])
+        first_mag = mag_stamps <= end
+        first_mag[first_mag] = [st.is_mag_sample(mag) for mag in mags[first_mag]]
         self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
         rows = np.zeros(len(imu), ORIENTATION_DTYPE)
         after = mag_stamps >= origin
@@ -361,6 +367,8 @@ class OrientationEstimator:
 
     def _align(self, stamps, samples, mag_stamps, mag):
         p, par = self.params, self._par
+        usable = usable_mags(mag, par[st.P_MAG_RANGE:st.P_MAG_RANGE + 3])
+        mag_stamps, mag = mag_stamps[usable], mag[usable]
         calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
                       @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
         self._alignment = align(
@@ -393,6 +401,7 @@ class OrientationEstimator:
         par[st.P_BIAS_WALK] = p.gyro_bias_walk
         par[st.P_AXES_SD] = p.axes_sd
         par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyro_range, np.nan)
+        par[st.P_MAG_RANGE:st.P_MAG_RANGE + 3] = _axes(p.mag_range, np.nan)
         par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
         par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset
         par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9] = p.mag_matrix

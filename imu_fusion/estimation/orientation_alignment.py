@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from imu_fusion.estimation import orientation_mag_limit as limit
 from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
 
 # Largest rate that can be a gyroscope's bias, and largest scatter of rate and specific
@@ -19,6 +20,9 @@ _BIAS_LIMIT = 0.2          # rad/s
 _REST_RATE_SCATTER = 0.05  # rad/s
 _REST_ACC_SCATTER = 0.4    # m/s^2
 _STANDARD_GRAVITY = 9.80665
+# Field norms that differ by more than this factor from their median are outliers: hard iron
+# and motion change them by less.
+_NORM_FACTOR = 3.0
 # Below this share of the field horizontal, heading is noise: the magnetic poles.
 _HORIZONTAL_SHARE = 0.02
 
@@ -65,6 +69,28 @@ def triad(acc, mag, declination):
     east = math.cos(declination) * east_mag + math.sin(declination) * north_mag
     north = -math.sin(declination) * east_mag + math.cos(declination) * north_mag
     return np.array([east, north, up])
+
+
+def usable_mags(mag, ranges):
+    """Mask (m,) of the samples of the first interval that measure the field.
+
+    Left out are samples with an axis at its limit, also those before the limit was
+    recognised, and outliers.
+
+    Args:
+        mag: (m, 3) tesla, finite, as the sensor reports it. ranges: (3,) tesla or nan.
+    """
+    if len(mag) == 0:
+        return np.zeros(0, dtype=bool)
+    floats, ints = np.zeros(limit.FLOATS), np.zeros(limit.INTS, dtype=np.int64)
+    for _ in range(2):
+        usable = np.array([not limit.is_saturated(floats, ints, ranges, sample)
+                           for sample in mag])
+    norm = np.linalg.norm(mag, axis=1)
+    if usable.any():
+        median = np.median(norm[usable])
+        usable &= (norm < _NORM_FACTOR * median) & (norm > median / _NORM_FACTOR)
+    return usable
 
 
 @njit(cache=True)

@@ -202,7 +202,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
         k[st.LAST_STAMP] = stamp
         k[st.STARTED] = 1
     dt = (stamp - k[st.LAST_STAMP]) * 1e-9
-    flags = 0
+    flags = st.mag_flags(k)
     move = x[MOVE:MOVE + es.MOVE_SIZE]
 
     clipped = find_limits(x, k, par, gyr)

@@ -17,8 +17,8 @@ from imu_fusion.estimation.orientation_state import (
     FLAG_SATURATED, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, K_COMMON, LAST_STAMP, MAG_USED,
     P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_COMMON, P_GAP_RATE_SD, P_GYR_DENSITY,
     P_MAG_SD, P_MAX_GAP, P_RANGE, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
-    TAKEN_WORDS, U, UNIFORM_VARIANCE, X_COMMON, is_newer, push_mag, push_rotation, take_mags,
-    write_row)
+    TAKEN_WORDS, U, UNIFORM_VARIANCE, X_COMMON, is_newer, mag_flags, push_mag, push_rotation,
+    take_mags, write_row)
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
     quat_to_matrix, right_jacobian, skew)
@@ -215,7 +215,7 @@ def step_imu(x, k, par, stamp, sample, row, row_int):
     cov = x[COV:COV + N * N].reshape(N, N)
     bias = x[GYR_BIAS:GYR_BIAS + 3]
     rate_next = gyr - bias
-    flags = 0
+    flags = mag_flags(k)
     dt = 0.0
     rate = rate_next
     if k[STARTED]:

@@ -15,6 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
+from imu_fusion.estimation import orientation_mag_limit as limit
 from imu_fusion.geometry.rotation import (
     quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, quat_rotate,
     quat_to_matrix)
@@ -42,6 +43,7 @@ FLAG_SATURATED = 8      # a gyroscope axis is at its limit
 FLAG_GAP = 16           # samples are missing before this one
 FLAG_ALIGNING = 32      # inside the interval from which the initial orientation was found
 FLAG_NO_HEADING = 64    # no magnetometer sample has fixed the heading yet
+FLAG_MAG_SATURATED = 128  # a magnetometer sample was refused: an axis is at its limit
 
 UNIFORM_VARIANCE = math.pi ** 2 / 3.0   # rad^2, of an angle about which nothing is known
 
@@ -62,7 +64,8 @@ HISTORY = 18       # ring of U
 HISTORY_LENGTH = 256
 PENDING = HISTORY + 4 * HISTORY_LENGTH   # samples that wait for the Imu to pass them
 PENDING_LENGTH = 8
-X_COMMON = PENDING + 3 * PENDING_LENGTH
+MAG_FLOATS = PENDING + 3 * PENDING_LENGTH  # of orientation_mag_limit
+X_COMMON = MAG_FLOATS + limit.FLOATS
 
 # Integer state common to all kernels.
 LAST_STAMP = 0
@@ -75,7 +78,10 @@ IMU_USED, IMU_REJECTED, MAG_USED, MAG_REJECTED, MAG_LATE, MAG_DISTURBED = range(
 GAPS, SATURATED = 12, 13
 HISTORY_STAMPS = 14
 PENDING_STAMPS = HISTORY_STAMPS + HISTORY_LENGTH
-K_COMMON = PENDING_STAMPS + PENDING_LENGTH
+MAG_INTS = PENDING_STAMPS + PENDING_LENGTH  # of orientation_mag_limit
+MAG_SATURATED = MAG_INTS + limit.INTS
+MAG_FLAGS = MAG_SATURATED + 1               # of the samples since the last row
+K_COMMON = MAG_FLAGS + 1
 
 # Parameters common to all kernels, one float64 array.
 P_GYR_DELAY, P_MAX_LAG, P_MAX_GAP, P_GYR_DENSITY, P_ACC_DENSITY, P_ACC_BIAS_SD = range(6)
@@ -85,14 +91,33 @@ P_FRAME = 14       # (4,) rotation from ENU to the published world frame
 P_IRON_OFFSET = 18  # (3,) tesla
 P_IRON_MATRIX = 21  # (9,) row by row
 P_AXES_SD = 30
-P_COMMON = 31
+P_MAG_RANGE = 31   # (3,) tesla, nan if it is to be found
+P_COMMON = 34
 TAKEN_WORDS = 10   # per magnetometer sample taken: field (3), rate (3), rotation (4)
+
+# What no sensor of this world reports, whatever its unit: a broken message.
+_WILD_RATE = 1e4        # rad/s
+_WILD_FORCE = 1e6       # m/s^2
+_WILD_FIELD = 1e6       # T
+_NO_FIELD = 1e-9        # T: zeros of a magnetometer that is not there; rooms shield to more
 
 
 @njit(cache=True)
-def is_finite3(v):
-    """Whether the three elements of v are finite numbers."""
-    return math.isfinite(v[0]) and math.isfinite(v[1]) and math.isfinite(v[2])
+def _is_within(v, bound):
+    """Whether the three elements of v are finite and not larger than ``bound``."""
+    return abs(v[0]) <= bound and abs(v[1]) <= bound and abs(v[2]) <= bound
+
+
+@njit(cache=True)
+def is_imu_sample(sample):
+    """Whether (6,) rate rad/s and specific force m/s^2 are numbers that a sensor can report."""
+    return _is_within(sample[:3], _WILD_RATE) and _is_within(sample[3:6], _WILD_FORCE)
+
+
+@njit(cache=True)
+def is_mag_sample(mag):
+    """Whether (3,) tesla are numbers that a sensor can report."""
+    return _is_within(mag, _WILD_FIELD) and not _is_within(mag, _NO_FIELD)
 
 
 @njit(cache=True)
@@ -154,10 +179,16 @@ def push_mag(x, k, par, stamp, mag):
     """Take one magnetometer sample (tesla, imu axes), in any order of arrival.
 
     It belongs to ``stamp`` less the magnetometer's delay; samples older than the
-    permitted lag are counted and dropped.
+    permitted lag are counted and dropped, and so are those with an axis at its limit.
     """
-    if not is_finite3(mag) or not k[STARTED]:
+    if not is_mag_sample(mag) or not k[STARTED]:
         k[MAG_REJECTED] += 1
+        return
+    if limit.is_saturated(x[MAG_FLOATS:MAG_FLOATS + limit.FLOATS],
+                          k[MAG_INTS:MAG_INTS + limit.INTS],
+                          par[P_MAG_RANGE:P_MAG_RANGE + 3], mag):
+        k[MAG_SATURATED] += 1
+        k[MAG_FLAGS] |= FLAG_MAG_SATURATED
         return
     if k[LAST_STAMP] - stamp > par[P_MAX_LAG] * 1e9:
         k[MAG_LATE] += 1
@@ -168,6 +199,9 @@ def push_mag(x, k, par, stamp, mag):
         for j in range(3):
             calibrated[i] += (par[P_IRON_MATRIX + 3 * i + j]
                               * (mag[j] - par[P_IRON_OFFSET + j]))
+    if _is_within(calibrated, _NO_FIELD):
+        k[MAG_REJECTED] += 1
+        return
     if k[PENDING_COUNT] == PENDING_LENGTH:
         # A magnetometer far faster than the Imu: the oldest waiting sample goes.
         k[MAG_REJECTED] += 1
@@ -209,10 +243,17 @@ def take_mags(x, k, taken):
 
 
 @njit(cache=True)
+def mag_flags(k):
+    """FLAG constants of magnetometer samples that were refused since the last row; clears them."""
+    flags = k[MAG_FLAGS]
+    k[MAG_FLAGS] = 0
+    return flags
+
+
+@njit(cache=True)
 def is_newer(k, stamp, sample):
-    """Whether an Imu sample can be used: finite, and newer than the last. Counts it."""
-    good = is_finite3(sample[:3]) and is_finite3(sample[3:6])
-    if not good or (k[STARTED] and stamp <= k[LAST_STAMP]):
+    """Whether an Imu sample can be used: possible, and newer than the last. Counts it."""
+    if not is_imu_sample(sample) or (k[STARTED] and stamp <= k[LAST_STAMP]):
         k[IMU_REJECTED] += 1
         return False
     k[IMU_USED] += 1
