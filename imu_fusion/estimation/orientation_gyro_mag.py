@@ -5,30 +5,40 @@ midpoint rule for the rates (6) and of the constancy of the field (8), solved by
 Gauss-Newton. A covariance of [attitude error in world axes, gyroscope bias,
 field error relative to its norm] goes alongside: the gain of the paper is not the
 optimal one, so the covariance is updated in the form that holds for any gain.
+
+That is the method as printed: ``estimate_bias: false``. With ``estimate_bias`` (the
+default) the same two sets of rows are weighted by their covariances instead of by 2
+and w, and solved together with the slow states of gyroscope and magnetometer: that is
+the error-state filter of orientation_fusion without its accelerometer. Which of the
+two runs is settled by the parameters at the start.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
 
+from imu_fusion.estimation import orientation_fusion as fusion
+from imu_fusion.estimation.orientation_fusion_layout import P_ESTIMATE_BIAS, P_REST_FORCE
 from imu_fusion.estimation.orientation_state import (
     ALIGN_UNTIL, FIELD, FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING,
-    FLAG_SATURATED, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, K_COMMON, LAST_STAMP, MAG_USED,
-    P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_COMMON, P_GAP_RATE_SD, P_GYR_DENSITY,
+    FLAG_SATURATED, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, LAST_STAMP, MAG_USED,
+    P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_GAP_RATE_SD, P_GYR_DENSITY,
     P_MAG_SD, P_MAX_GAP, P_RANGE, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
-    TAKEN_WORDS, U, UNIFORM_VARIANCE, X_COMMON, is_newer, mag_flags, push_mag, push_rotation,
+    TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
     take_mags, write_row)
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
     quat_to_matrix, right_jacobian, skew)
 
-COV = X_COMMON                 # (9, 9): attitude, bias, relative field
+COV = fusion.X_SIZE            # (9, 9): attitude, bias, relative field
 N = 9
 X_SIZE = COV + N * N
-K_SIZE = K_COMMON
-P_FIELD_SD, P_FIELD_TIME = P_COMMON, P_COMMON + 1
-P_SIZE = P_COMMON + 2
+AS_PRINTED = fusion.K_SIZE     # 1: Winkler (9) and nothing else
+K_SIZE = AS_PRINTED + 1
+P_FIELD_SD, P_FIELD_TIME = fusion.P_SIZE, fusion.P_SIZE + 1
+P_SIZE = P_FIELD_TIME + 1
 
 # Gauss-Newton converges quadratically from the gyroscope's own rotation; the
 # limit is reached only by steps of more than a radian.
@@ -37,12 +47,18 @@ _ITERATIONS = 8
 
 def pack(par, params):
     """Write this kernel's own parameters (OrientationParams) behind the common ones."""
+    fusion.pack(par, replace(params, use_acc=False))
+    par[P_REST_FORCE] = math.inf   # rest, too, is judged without the accelerometer
     par[P_FIELD_SD] = params.field_sd
     par[P_FIELD_TIME] = params.field_time
 
 
 def initialise(x, k, par, alignment):
     """Start from an Alignment. x, k: zeroed state."""
+    if par[P_ESTIMATE_BIAS]:
+        fusion.initialise(x, k, par, alignment)
+        return
+    k[AS_PRINTED] = 1
     x[Q:Q + 4] = alignment.quat_world_imu
     x[U:U + 4] = 0.0, 0.0, 0.0, 1.0
     x[GYR_BIAS:GYR_BIAS + 3] = alignment.gyr_bias
@@ -195,19 +211,8 @@ def _correct(cov, gain, b, weight, noise_sd):
 
 
 @njit(cache=True)
-def step_imu(x, k, par, stamp, sample, row, row_int):
-    """One Imu sample through the filter.
-
-    Args:
-        x, k, par: state and parameters, in place.
-        stamp: int64 ns.
-        sample: (6,) rate rad/s, specific force m/s^2.
-        row, row_int: float and integer view of the output row.
-
-    Returns:
-        1 if a row was written, 0 if the sample was refused (not finite, or not
-        newer than the last).
-    """
+def _step_as_printed(x, k, par, stamp, sample, row, row_int):
+    """step_imu with the rotation of (9)."""
     if not is_newer(k, stamp, sample):
         return 0
     gyr = sample[:3].copy()
@@ -289,6 +294,25 @@ def step_imu(x, k, par, stamp, sample, row, row_int):
               par[P_ACC_DENSITY] ** 2 / noise_dt + par[P_ACC_BIAS_SD] ** 2, bias, bias_var,
               mag, reliability, flags, taken)
     return 1
+
+
+@njit(cache=True)
+def step_imu(x, k, par, stamp, sample, row, row_int):
+    """One Imu sample through the filter.
+
+    Args:
+        x, k, par: state and parameters, in place.
+        stamp: int64 ns.
+        sample: (6,) rate rad/s, specific force m/s^2.
+        row, row_int: float and integer view of the output row.
+
+    Returns:
+        1 if a row was written, 0 if the sample was refused (not finite, or not
+        newer than the last).
+    """
+    if not k[AS_PRINTED]:
+        return min(fusion.step_imu(x, k, par, stamp, sample, row, row_int), 1)
+    return _step_as_printed(x, k, par, stamp, sample, row, row_int)
 
 
 @njit(cache=True)
