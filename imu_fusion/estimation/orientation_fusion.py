@@ -46,6 +46,7 @@ _SWAY_TIME = 3.0           # s: velocity changes faster than this show in SWAY
 _MOTION_TIME = 10.0        # s: over which the size of the motion is judged
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
+_LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
 _BURST_SHARE = 0.5         # of the block, while an axis is at its limit
 
 
@@ -169,6 +170,10 @@ def _end_block(x, k, par, still, back, tape):
         x[st.GYR_BIAS + i] = x[S + es.BIAS + i]
         if (back >> i) & 1:
             x[S + es.EXCESS + i] = 0.0
+    # A wrong lag beyond belief would keep every further sample from being used.
+    bound = _LAG_SDS * par[P_LAG_SD]
+    if bound > 0.0:
+        x[S + es.LAG] = min(max(x[S + es.LAG], -bound), bound)
     x[st.LAG] = x[S + es.LAG]
     if len(tape):
         tape[es.TAPE_COV:es.TAPE_COV + N * N] = x[COV:COV + N * N]

@@ -63,7 +63,7 @@ LAG = 17           # how much later magnetometer samples are stamped than rates,
 HISTORY = 18       # ring of U
 HISTORY_LENGTH = 256
 PENDING = HISTORY + 4 * HISTORY_LENGTH   # samples that wait for the Imu to pass them
-PENDING_LENGTH = 8
+PENDING_LENGTH = 128  # at 1 kHz more than the largest delay, 0.1 s
 MAG_FLOATS = PENDING + 3 * PENDING_LENGTH  # of orientation_mag_limit
 X_COMMON = MAG_FLOATS + limit.FLOATS
 

@@ -276,3 +276,33 @@ def test_update_and_its_adjoint_against_dense_algebra():
     es.unupdate(tape[es.TAPE_OP:es.TAPE_OP + es.OP_SIZE], adjoint, information)
     assert adjoint == pytest.approx(expected)
     assert information == pytest.approx(expected_information)
+
+
+def test_magnetometer_ahead_of_the_gyroscope_is_used():
+    """A negative delay makes samples wait for the Imu: all of them are used in the end."""
+    for rate, lead in ((286.0, 0.03), (1000.0, 0.09)):
+        imu, mag, truth, _ = simulate(Tumbling(seed=5), 6.0, rate=rate,
+                                      sensors=Sensors(mag_delay=-lead, mag_sd=3e-7))
+        estimator = OrientationEstimator(OrientationParams(mag_delay=-lead, max_mag_lag=0.2))
+        estimator.run(imu, mag)
+        summary = estimator.summary()
+        waiting = int(lead * rate) + 3      # and the sample before the first Imu
+        assert summary["mag_used"] + summary["mag_disturbed"] >= len(mag.stamp) - waiting
+        assert summary["mag_rejected"] <= 1
+
+
+def test_lag_stays_within_belief_and_samples_in_use():
+    """A field that turns when the motion begins looks like a lag: it must not end the samples."""
+    imu, mag, truth, _ = simulate(Tumbling(seed=6), 30.0, rate=286.0,
+                                  sensors=Sensors(mag_sd=3e-7, gyr_density=3e-4))
+    false = mag.mag.copy()
+    start = np.searchsorted(mag.stamp, int(2e9))
+    lost = slice(start, start + 286)
+    # What the sensor will show 60 ms later, for one second: a lag of six standard deviations.
+    false[lost] = mag.mag[start + 17:start + 17 + 286]
+    params = OrientationParams(mag_delay_sd=0.01)
+    estimator = OrientationEstimator(params)
+    rows = estimator.run(imu, MagLog(mag.stamp, false))
+    lag = estimator.summary()["mag_delay"]
+    assert abs(lag) <= 3 * params.mag_delay_sd
+    assert (rows["mag_count"][-286:] > 0).mean() > 0.99
