@@ -23,6 +23,7 @@ _STATES = {
     "mag_bias": ("magnetometer bias", "µT", 1e6, _XYZ),
     "mag_scale": ("magnetometer scale", "%", 100.0, _XYZ),
     "gnss_position_error": ("GNSS position error", "m", 1.0, _ENU),
+    "gnss_velocity_error": ("GNSS velocity error", "m/s", 1.0, _ENU),
     "gnss_time_offset": ("delay of the GNSS", "ms", 1e3, ("delay",)),
     "velocity_time_offset": ("further delay of velocities", "ms", 1e3, ("delay",)),
     "acc_matrix": ("accelerometer matrix", "%", 100.0, tuple(a + b for a in "xyz" for b in "xyz")),

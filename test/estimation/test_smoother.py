@@ -10,6 +10,7 @@ from benchmarks.jumps import score
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.inputs import even_stamps
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
@@ -127,6 +128,19 @@ def test_wandering_position_error_needs_its_state(jump):
     # Lateral position past the table is only as good as the wandering fixes.
     check(r, wander, jump.hill, BOUNDS * [2, 3, 1, 1, 1.5, 1, 1, 1, 1])
     assert "gnss_position_error" in r.states
+
+
+def test_jittered_stamps_of_even_fixes_are_put_back():
+    rng = np.random.default_rng(0)
+    epoch = np.delete(np.arange(500), [7, 8, 100, 250])
+    true = EPOCH + epoch * 200_000_000
+    jitter = np.round(rng.uniform(-0.04, 0.06, len(true)) * 1e9).astype(np.int64)
+    error = (even_stamps(true + jitter) - true) * 1e-9
+    # The mean lateness stays (it is the receiver's delay); the jitter of 29 ms goes.
+    assert abs(error.mean() - jitter.mean() * 1e-9) < 1e-4 and error.std() < 5e-3
+    assert np.array_equal(even_stamps(true), true)
+    with pytest.raises(SampleError, match="gnss_even_stamps"):
+        even_stamps(np.sort(EPOCH + rng.integers(0, 100 * 10**9, 300)))
 
 
 def test_clipped_gyroscope_is_bridged(jump):

@@ -113,6 +113,7 @@ def test_solver_agrees_with_dense_algebra():
     x = np.stack([random_state(rng)] * count)
     dt, decay_rate = np.full(count - 1, 0.02), np.zeros(n)
     decay_rate[LAYOUT[model.GNSS_ERROR]:LAYOUT[model.GNSS_ERROR] + 3] = 2.0
+    decay_rate[LAYOUT[model.GNSS_VELOCITY_ERROR]:] = 5.0
     walk = np.zeros(n)
     walk[9:15] = 0.01
     walk[LAYOUT[model.GNSS_ERROR]:LAYOUT[model.GNSS_ERROR] + 3] = 0.5

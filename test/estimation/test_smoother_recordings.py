@@ -47,8 +47,28 @@ def test_flight_innovations():
     for name in ("fix", "velocity"):
         rms = np.sqrt(np.mean(result.innovations[name][1] ** 2, axis=0))
         assert np.all((rms > 0.4) & (rms < 1.3)), name
-    # GNSS of an autopilot of 2013: some 0.2 s late.
-    assert 0.15 < result.states["gnss_time_offset"][0][0, 0] < 0.35
+
+
+def test_flight_attitude_and_whiteness():
+    data = smoother_flight.load()
+    if data is None:
+        pytest.skip("px4_plane is not at hand: set IMU_FUSION_DATA")
+    imu, _, fix, velocity, (stamp, reference) = data
+    result = Smoother(smoother_flight.PARAMS).run(imu, None, fix, velocity)
+    assert result.converged
+    for name in ("fix", "velocity"):
+        innovation = result.innovations[name][1]
+        assert 0.92 < np.mean(np.abs(innovation) <= 1.96) < 0.985, name
+        r = np.abs(smoother_flight.autocorrelation(innovation))
+        # White errors and stamps as logged: up to 0.95 at the first lag, 0.92 later.
+        assert r[0].max() < 0.5 and r[1:].max() < 0.2, name
+    # The autopilot follows a compass beside the motor; force and GNSS velocity tell who is right.
+    late = result.states["gnss_time_offset"][0][0, 0]
+    assert 0.15 < late < 0.35
+    ours = smoother_flight.acceleration_misfit(
+        result.samples["stamp"], result.samples["quat_world_imu"], imu, velocity, late)
+    autopilot = smoother_flight.acceleration_misfit(stamp, reference, imu, velocity, late)
+    assert np.all(ours[:2] < 0.5 * autopilot[:2])
 
 
 def test_indoor_walk_admits_what_its_position_is_worth():

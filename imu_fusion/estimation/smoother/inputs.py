@@ -142,6 +142,43 @@ def _covariances(given, default_sd, what):
         raise SampleError(f"a covariance of {what} is not positive definite") from None
 
 
+def even_stamps(stamp):
+    """Stamps on a straight line through those of readings taken at an even rate.
+
+    A logger stamps a fix when it arrives; the receiver takes it at its own even epochs.
+
+    Args:
+        stamp: (m,) ns, ascending; epochs may be missing.
+
+    Returns:
+        (m,) ns. The mean lateness stays: it is the constant delay of the receiver.
+
+    Raises:
+        SampleError: a stamp lies half a period or more off the line.
+    """
+    if len(stamp) < 3:
+        return stamp
+    seconds = (stamp - stamp[0]) * 1e-9
+    # A mean of the shorter half of the steps would be biased; jitter cancels over many steps.
+    lag = min(10, len(stamp) - 1)
+    period = float(np.median(seconds[lag:] - seconds[:-lag])) / lag
+    epoch = np.empty(len(stamp))
+    count, line = 0, 0.0
+    for i, late in enumerate(seconds):
+        count += max(1, round((late - line) / period)) if i else 0
+        # The line follows slowly, since a single stamp jitters.
+        expected = late if not i else line + (count - epoch[i - 1]) * period
+        line = expected + 0.1 * (late - expected)
+        epoch[i] = count
+    slope, start = np.polyfit(epoch, seconds, 1)
+    even = start + slope * epoch
+    off = float(np.abs(even - seconds).max())
+    if off >= 0.5 * slope:
+        raise SampleError(f"GNSS stamps lie up to {off:.2f} s off even steps of {slope:.3f} s: "
+                          "they are not taken at an even rate (gnss_even_stamps: false)")
+    return stamp[0] + np.round(even * 1e9).astype(np.int64)
+
+
 def prepare_measurements(frame, mag, fix, velocity, params):
     """All readings as :class:`Measurements`; those that are not finite are left out.
 
@@ -168,6 +205,8 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         root = np.broadcast_to(params.mag_sd * _MICRO * eye, (len(mag), 3, 3))
         parts.append((mag.stamp, MAG, mag.mag * _MICRO, root, params.mag_loss_scale))
     whiten = np.concatenate([np.linalg.inv(p[3]) for p in parts])
+    if params.gnss_even_stamps:
+        parts = [(p[0] if p[1] == MAG else even_stamps(p[0]), *p[1:]) for p in parts]
     return Measurements(
         stamp=np.concatenate([p[0] for p in parts]),
         kind=np.concatenate([np.full(len(p[0]), p[1]) for p in parts]),

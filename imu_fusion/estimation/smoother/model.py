@@ -21,15 +21,15 @@ POS, VEL, ATT, GYR_BIAS, ACC_BIAS, CORE = 0, 3, 6, 9, 12, 15
 #: Optional blocks of the error state, in their order, with their sizes.
 BLOCKS = (("mag_bias", 3), ("mag_scale", 3), ("gnss_position_error", 3),
           ("gnss_time_offset", 1), ("velocity_time_offset", 1), ("acc_matrix", 9),
-          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1))
+          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1), ("gnss_velocity_error", 3))
 (MAG_BIAS, MAG_SCALE, GNSS_ERROR, TIME_OFFSET, VELOCITY_OFFSET, ACC_MATRIX, GYR_SCALE,
- LEVER_ARM, BODY_HEIGHT) = range(9)
+ LEVER_ARM, BODY_HEIGHT, GNSS_VELOCITY_ERROR) = range(10)
 
 FIX, VELOCITY, MAG = 0, 1, 2
 
 
 def make_layout(present):
-    """First error index of each block (8,), -1 where absent, and the size of the error state."""
+    """First error index of each block, -1 where absent, and the size of the error state."""
     layout, size = np.full(len(BLOCKS), -1), CORE
     for i, (name, width) in enumerate(BLOCKS):
         if name in present:
@@ -188,6 +188,10 @@ def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, lever, layo
         h[i, VEL + i] = 1.0
         for j in range(3):
             h[i, ATT + j] += tau / dt * f_vel[i, ATT + j]
+    if layout[GNSS_VELOCITY_ERROR] >= 0:
+        for i in range(3):
+            predicted[i] += x[layout[GNSS_VELOCITY_ERROR] + 1 + i]
+            h[i, layout[GNSS_VELOCITY_ERROR] + i] = 1.0
     for block in (TIME_OFFSET, VELOCITY_OFFSET):
         if layout[block] >= 0:
             for i in range(3):

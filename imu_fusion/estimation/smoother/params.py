@@ -50,6 +50,12 @@ class SmootherParams(Parameters):
         (0.0, 0.0, 0.0), doc="Wandering (Gauss-Markov) GNSS position error east, north, up, as "
         "states", unit="m", low=0.0, length=3)
     gnss_position_error_tau: float = param(30.0, doc="Its correlation time", unit="s", low=0.1)
+    gnss_velocity_error_sd: tuple[float, ...] = param(
+        (0.0, 0.0, 0.0), doc="Wandering (Gauss-Markov) GNSS velocity error east, north, up, as "
+        "states; receivers filter their velocities", unit="m/s", low=0.0, length=3)
+    gnss_velocity_error_tau: float = param(1.0, doc="Its correlation time", unit="s", low=0.01)
+    gnss_even_stamps: bool = param(False, doc="Fixes are taken at an even rate and their stamps, "
+                                   "times of arrival, jitter: put them back on a straight line")
     gnss_time_offset_sd: float = param(0.0, doc="Delay of the GNSS stamps as a state", unit="s",
                                        low=0.0, high=2.0)
     velocity_time_offset_sd: float = param(0.0, doc="Further delay of velocities alone as a state; "

@@ -72,14 +72,15 @@ class Smoother:
     def _problem(self, prepared, frame, measurements, constraints, fix):
         p = self.params
         has_mag = bool(np.any(measurements.kind == model.MAG))
-        wander = np.array(p.gnss_position_error_sd)
+        wander, drift = np.array(p.gnss_position_error_sd), np.array(p.gnss_velocity_error_sd)
         blocks = {"mag_bias": [p.mag_bias_sd * 1e6] * 3 if has_mag else 0,
                   "mag_scale": [p.mag_scale_sd] * 3 if has_mag else 0,
                   "gnss_position_error": wander if wander.any() else 0,
                   "gnss_time_offset": [p.gnss_time_offset_sd],
                   "velocity_time_offset": [p.velocity_time_offset_sd], "acc_matrix": [p.acc_matrix_sd] * 9,
                   "gyr_scale": [p.gyro_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
-                  "body_height": [p.body_height_sd]}
+                  "body_height": [p.body_height_sd],
+                  "gnss_velocity_error": drift if drift.any() else 0}
         present = {name: sd for name, sd in blocks.items() if np.any(sd)}
         layout, size = model.make_layout(present)
         sd = np.concatenate([[p.position_sd] * 3, [p.speed_sd] * 3, [p.attitude_sd] * 3,
@@ -88,11 +89,13 @@ class Smoother:
         decay, walk = np.zeros(size), np.zeros(size)
         walk[model.GYR_BIAS:model.GYR_BIAS + 3] = p.gyro_bias_walk ** 2
         walk[model.ACC_BIAS:model.ACC_BIAS + 3] = p.acc_bias_walk ** 2
-        i = layout[model.GNSS_ERROR]
-        if i >= 0:
-            decay[i:i + 3] = 1.0 / p.gnss_position_error_tau
-            walk[i:i + 3] = 2.0 * wander ** 2 * decay[i]
-            sd[i:i + 3] = np.maximum(wander, 1e-6)
+        for block, spread, tau in ((model.GNSS_ERROR, wander, p.gnss_position_error_tau),
+                                   (model.GNSS_VELOCITY_ERROR, drift, p.gnss_velocity_error_tau)):
+            i = layout[block]
+            if i >= 0:
+                decay[i:i + 3] = 1.0 / tau
+                walk[i:i + 3] = 2.0 * spread ** 2 * decay[i]
+                sd[i:i + 3] = np.maximum(spread, 1e-6)
         gravity = p.gravity
         if gravity is None:
             gravity = float(normal_gravity(frame.latitude_deg, frame.height))
