@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
+RESULTS = Path(__file__).parent / "results"
+
 
 def write_table(name, header, rows, note=""):
     """Print a table and write it to ``benchmarks/results/<name>.md``."""
     lines = ["| " + " | ".join(map(str, header)) + " |", "|" + "---|" * len(header)]
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
     text = "\n".join(lines) + "\n" + (f"\n{note}\n" if note else "")
-    folder = Path(__file__).parent / "results"
-    folder.mkdir(exist_ok=True)
-    (folder / f"{name}.md").write_text(text)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.md").write_text(text)
     print(text)

@@ -33,8 +33,9 @@ class OrientationParams(Parameters):
     """What the orientation estimator can be told."""
 
     method: str = param("fusion", choices=("fusion", "gyro_mag"),
-                        doc="fusion: error-state filter over all three sensors; gyro_mag: "
-                            "Winkler 2025, gyroscope and magnetometer.")
+                        doc="fusion: error-state filter over all three sensors; gyro_mag: gyroscope and "
+                            "magnetometer alone after the start, with estimate_bias false "
+                            "Winkler 2025 as printed.")
     mode: str = param("causal", choices=("causal", "smoothed"),
                       doc="smoothed: run() on a whole recording also looks ahead (fusion only).")
     world_frame: str = param("enu", choices=("enu", "ned", "nwu"),
@@ -61,7 +62,7 @@ class OrientationParams(Parameters):
     gyro_range: tuple[float, ...] | None = param(
         None, unit="rad/s", low=1e-3, length=(1, 3),
         doc="Largest rate the gyroscope reports, one value or one per axis; unset: found "
-            "from flat tops by fusion.")
+            "from flat tops (not by gyro_mag as printed).")
     acc_noise_density: float = param(2e-3, unit="m/s^2/sqrt(Hz)", low=1e-9, high=10,
                                      doc="Accelerometer noise.")
     acc_bias_sd: float = param(0.05, unit="m/s^2", low=0, high=10,
@@ -82,15 +83,16 @@ class OrientationParams(Parameters):
         doc="Soft iron, row by row; multiplies the sample after the offset.")
     mag_reliability: float = param(5.0, low=0, doc="p of the weight (10) of Winkler 2025.")
     field_sd: float = param(0.05, low=0, high=1,
-                            doc="gyro_mag: wander of the local field, relative to its norm.")
+                            doc="gyro_mag as printed: wander of the local field, relative "
+                                "to its norm.")
     field_time: float = param(20.0, unit="s", low=1e-3,
-                              doc="gyro_mag: time constant of that wander.")
+                              doc="gyro_mag as printed: time constant of that wander.")
     gyro_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
                              doc="How late rates and specific forces are stamped.")
     mag_delay: float | None = param(
         None, unit="s", low=-0.1, high=0.1,
-        doc="How late a magnetometer sample is stamped; unset: estimated by fusion, "
-            "that of the gyroscope in gyro_mag.")
+        doc="How late a magnetometer sample is stamped; unset: estimated, except "
+            "by gyro_mag as printed, which takes that of the gyroscope.")
     mag_delay_sd: float = param(0.01, unit="s", low=0, high=0.1,
                                 doc="Standard deviation of a magnetometer delay that is not given.")
     block: float = param(0.02, unit="s", low=1e-3, high=1, doc="Time between corrections.")

@@ -10,7 +10,7 @@ estimators keep it about the axes of the sensor.
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -80,10 +80,14 @@ def pose_message(stamp, frame_id, quat_world_imu, position_world=(0.0, 0.0, 0.0)
     return POSE.encode(stamp, frame_id, [*position_world, *quat_world_imu])
 
 
-def orientation_message(row, frame_id):
-    """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator."""
+def orientation_message(row, frame_id, has_force):
+    """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator.
+
+    ``has_force``: whether the sensor measures specific force; if not it is absent.
+    """
     rotation = quat_to_matrix(row["quat_world_imu"])
-    return imu_message(row["stamp"], frame_id, row["gyr"], row["acc"], row["quat_world_imu"],
+    return imu_message(row["stamp"], frame_id, row["gyr"], row["acc"] if has_force else None,
+                       row["quat_world_imu"],
                        rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
 
 
@@ -121,6 +125,14 @@ def imu_values(values):
     for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_acceleration")):
         absent = values[..., IMU[field + "_covariance"].start] == -1.0
         result[..., part][absent] = np.nan
+    return result
+
+
+def gyroscope_first_values(values):
+    """As imu_values, but specific force is zero where absent: a gyroscope alone is enough."""
+    result = imu_values(values)
+    absent = values[..., IMU["linear_acceleration_covariance"].start] == -1.0
+    result[..., 3:][absent] = 0.0
     return result
 
 
@@ -190,6 +202,10 @@ SAMPLE_TYPES = {kind.layout.msgtype: kind for kind in (
     SampleType(FIX, 13, fix_values, _fix_log),
     SampleType(TWIST, 12, velocity_values, _velocity_log),
     SampleType(POSE, 7, pose_values, _pose_log))}
+
+
+GYROSCOPE_FIRST = replace(SAMPLE_TYPES[IMU.msgtype], values=gyroscope_first_values)
+"""The SampleType of estimators that can do without specific force."""
 
 
 def attitude_log(messages):

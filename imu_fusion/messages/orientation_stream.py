@@ -1,7 +1,7 @@
 """The orientation estimator between its topics, live and in batch."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from imu_fusion.estimation.orientation_state import FLAG_STILL
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_rotate,
                                           quat_rotate_inverse)
-from imu_fusion.messages.convert import (SAMPLE_TYPES, bool_message, orientation_message,
-                                         rpy_message)
+from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_message,
+                                         orientation_message, rpy_message)
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, VECTOR3
 from imu_fusion.messages.streams import Stream
 from imu_fusion.parameters import Parameters, param
@@ -27,8 +27,8 @@ RPY_TOPIC = "imu/rpy/filtered"
 STEADY_TOPIC = "imu/steady_state"
 
 # At equal stamps in this order: an Imu sample uses the field of its own stamp.
-INPUTS = {topic: SAMPLE_TYPES[layout.msgtype]
-          for topic, layout in ((FIX_TOPIC, FIX), (MAG_TOPIC, MAG), (IMU_TOPIC, IMU))}
+INPUTS = {FIX_TOPIC: SAMPLE_TYPES[FIX.msgtype], MAG_TOPIC: SAMPLE_TYPES[MAG.msgtype],
+          IMU_TOPIC: GYROSCOPE_FIRST}
 OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TOPIC: BOOL_TYPE}
 
 _UP = {"enu": 1.0, "nwu": 1.0, "ned": -1.0}  # z of the world frame's up
@@ -45,6 +45,17 @@ class OrientationOutputParams(Parameters):
                            doc="Gravity that remove_gravity_vector takes out.")
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
+
+
+def _without_lost(acc, had_force):
+    """Specific force (n, 3), NaN where it is absent (zero) though it was there before.
+
+    An Imu without accelerometer is used as a gyroscope; one that loses its force for a
+    while is not in free fall: that sample is refused.
+    """
+    present = acc.any(axis=1)
+    lost = ~present & (np.logical_or.accumulate(present) | had_force)
+    return np.where(lost[:, None], np.nan, acc)
 
 
 class _Writer:
@@ -64,9 +75,10 @@ class _Writer:
         """Yield (topic, stamp, cdr)."""
         for row in rows:
             stamp = int(row["stamp"])
+            has_force = bool(row["acc"].any())   # zero: a gyroscope without an accelerometer
             if self.turn or self._output.remove_gravity_vector:
-                row = self._changed(row)
-            yield ORIENTATION_TOPIC, stamp, orientation_message(row, frame_id)
+                row = self._changed(row, has_force)
+            yield ORIENTATION_TOPIC, stamp, orientation_message(row, frame_id, has_force)
             yield RPY_TOPIC, stamp, rpy_message(row, frame_id)
             steady = bool(row["flags"] & FLAG_STILL)
             if steady != self._steady:
@@ -80,11 +92,11 @@ class _Writer:
         """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
         self.turn += yaw - self.yaw
 
-    def _changed(self, row):
+    def _changed(self, row, has_force):
         row = row.copy()
         turn = quat_exp(np.array([0.0, 0.0, self._up * self.turn]))
         row["quat_world_imu"] = quat_multiply(turn, row["quat_world_imu"])
-        if self._output.remove_gravity_vector:
+        if self._output.remove_gravity_vector and has_force:
             up = np.array([0.0, 0.0, self._up * self._output.gravity])
             row["acc"] -= quat_rotate_inverse(row["quat_world_imu"], up)
         return row
@@ -143,10 +155,13 @@ class OrientationStream(Stream):
         self.estimator.reset()
         self._writer.turn = 0.0
         self._knows_north = False
+        self._has_force = False
 
     def take(self, topic, stamp, sample):
         if topic == IMU_TOPIC:
-            self._write(self.estimator.add_imu(stamp, sample[:3], sample[3:]))
+            force = _without_lost(sample[None, 3:], self._has_force)[0]
+            self._has_force |= bool(force.any())
+            self._write(self.estimator.add_imu(stamp, sample[:3], force))
         elif topic == MAG_TOPIC:
             if self._next_calibration is None or stamp >= self._next_calibration:
                 self._calibrator.add(sample)
@@ -252,6 +267,7 @@ def run(logs, report, params, output):
         estimator.reset()
         writer.turn = 0.0
         imu_part, mag_part = imu[imu_epochs == epoch], mag[mag_epochs == epoch]
+        imu_part = replace(imu_part, acc=_without_lost(imu_part.acc, False))
         stamp, turn = _first_north(params, fix, fix_epochs == epoch)
         if turn and params.mode == "smoothed":
             writer.turn = turn  # looking ahead, north is known from the start

@@ -6,6 +6,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.parameter import Parameter
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu, MagneticField
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -81,6 +82,44 @@ def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_
             assert sorted(live) == sorted(offline), topic
             if topic == "/imu/data":
                 assert len(offline) == len(recording[0]) - 2
+
+
+def test_a_gyroscope_alone_gives_orientation_and_says_what_is_absent(graph, recording, tmp_path):
+    """No accelerometer, no magnetometer: the turn since the start, in node and batch alike."""
+    imu, _ = recording
+    with BagWriter(tmp_path / "bag") as writer:
+        for stamp, gyr in zip(imu.stamp.tolist(), imu.gyr, strict=True):
+            writer.write("/imu/data_raw", IMU.msgtype, imu_message(stamp, "ball", gyr, None), stamp)
+    batch.process(tmp_path / "bag", tmp_path / "out")
+    sink = collector(graph, topics=OUTPUTS)
+    graph.start(OrientationEstimatorNode, qos="reliable")
+    replayer = graph.start(Replayer, bag=str(tmp_path / "bag"), rate=0.0)
+    graph.until(lambda: replayer.finished and sink.ended)
+    with open_bag(tmp_path / "out") as reader:
+        offline = [m[3] for m in reader.messages(["/imu/data"])]
+    live = [fields("/imu/data", cdr) for cdr in sink.messages["/imu/data"]]
+    assert sorted(live) == sorted(fields("/imu/data", cdr) for cdr in offline)
+    values = np.array([IMU.decode(cdr)[2] for cdr in offline])
+    assert len(values) == len(imu.stamp)
+    assert (values[:, IMU["linear_acceleration_covariance"].start] == -1.0).all()
+    truth = simulate(Tumbling(seed=3), 12.0, rate=200.0, mag_rate=47.0, sensors=NOISY, seed=4)[2]
+    got = Rotation.from_quat(values[:, IMU["orientation"]])
+    want = Rotation.from_quat(truth.quat_world_imu)
+    turned = (got[0].inv() * got) * (want[0].inv() * want).inv()
+    # Noise 3e-4 rad/s/sqrt(Hz) over 12 s is 0.06 deg; bias and scale are those of NOISY.
+    assert np.degrees(turned.magnitude()).max() < 5.0
+
+
+def test_force_that_is_lost_for_a_while_is_no_free_fall(recording, tmp_path):
+    imu, mag = recording
+    with BagWriter(tmp_path / "bag") as writer:
+        for i, stamp in enumerate(imu.stamp.tolist()):
+            force = None if 1000 <= i < 1400 and i % 2 else imu.acc[i]
+            writer.write("/imu/data_raw", IMU.msgtype,
+                         imu_message(stamp, "ball", imu.gyr[i], force), stamp)
+    batch.process(tmp_path / "bag", tmp_path / "out")
+    with open_bag(tmp_path / "out") as reader:
+        assert reader.topics["/imu/data"].count == len(imu.stamp) - 200
 
 
 def test_another_pass_gives_the_same_again(graph, recording, tmp_path):
