@@ -9,7 +9,7 @@ from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_layout import (
     BLOCK_MAGS, COV, HEADING_VAR, MAG_SUM, MOVE, N, NORM, P_HEADING_SD, P_LOCAL_SD,
-    P_MAG_RELATIVE, P_NORM_FACTOR, S, WORLD_TURNED)
+    P_MAG_RELATIVE, P_NORM_FACTOR, P_OFFSET_SD, P_SOFT_SD, S, WORLD_TURNED)
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix)
 
@@ -34,7 +34,10 @@ def start_field(x, k, par, z, has_heading, follow):
         cov[i, i] = 1.0 if i < es.LOCAL else par[P_LOCAL_SD] ** 2
     if has_heading:
         cov[es.ATT + 2, es.ATT + 2] += follow
-        x[HEADING_VAR] = par[P_HEADING_SD] ** 2 * (1.0 - follow)
+        # What is left of hard and soft iron turns the needle and stays in the heading.
+        iron = ((par[P_OFFSET_SD] ** 2 + par[P_SOFT_SD] ** 2)
+                / max(b[0] ** 2 + b[1] ** 2, 1e-4))
+        x[HEADING_VAR] = min(par[P_HEADING_SD] ** 2 + iron, st.UNIFORM_VARIANCE) * (1.0 - follow)
         k[st.HEADING_KNOWN] = 1
     quat = x[st.Q:st.Q + 4]
     r = quat_to_matrix(quat)

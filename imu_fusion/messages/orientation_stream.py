@@ -199,8 +199,7 @@ class OrientationStream(Stream):
             CalibrationError: the samples do not determine it.
         """
         calibration = self._calibrator.result()
-        found = {name: tuple(value) for name, value in calibration.to_parameters().items()}
-        self.params = self.params.replace(**found)
+        self.params = self.params.replace(**calibration.to_parameters())
         self.estimator = OrientationEstimator(self.params)
         self.restart()
         return calibration

@@ -50,9 +50,15 @@ class MagCalibration:
         return (np.asarray(mag) - self.offset) @ self.matrix.T
 
     def to_parameters(self):
-        """``mag_offset`` and ``mag_matrix`` as OrientationParams and YAML take them."""
+        """``mag_offset``, ``mag_matrix``, ``mag_offset_sd`` as OrientationParams and YAML take them.
+
+        ``mag_matrix_sd`` is not among them: an ellipsoid does not show how the magnetometer's
+        axes are turned against those of the Imu.
+        """
+        offset_sd = math.sqrt(np.trace(self.cov[:3, :3]) / 3.0) / self.field_norm
         return dict(mag_offset=[float(v) for v in self.offset],
-                    mag_matrix=[float(v) for v in self.matrix.ravel()])
+                    mag_matrix=[float(v) for v in self.matrix.ravel()],
+                    mag_offset_sd=min(float(offset_sd), 1.0))
 
 
 def coverage(directions):

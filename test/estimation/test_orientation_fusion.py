@@ -306,3 +306,20 @@ def test_lag_stays_within_belief_and_samples_in_use():
     lag = estimator.summary()["mag_delay"]
     assert abs(lag) <= 3 * params.mag_delay_sd
     assert (rows["mag_count"][-286:] > 0).mean() > 0.99
+
+
+def test_iron_left_over_is_part_of_the_heading_that_rest_anchors():
+    """Hard iron of 3 % of the field across magnetic north turns the needle, and is owned up to."""
+    field = earth_field()
+    up, north = np.array([0.0, 0.0, 1.0]), math.hypot(field[0], field[1])
+    iron = 0.03 * np.linalg.norm(field)
+    motion = Tumbling(seed=4, quat_start=(0.0, 0.0, 0.0, 1.0))
+    imu, mag, truth, _ = simulate(motion, 2.0, sensors=Sensors(mag_offset=(iron, 0.0, 0.0)))
+    rows = OrientationEstimator(OrientationParams(mag_matrix_sd=0.0)).run(imu, mag)
+    error = local_errors(rows, truth)[-1] @ up
+    sd = math.sqrt(rows["cov_attitude"][-1][2, 2])
+    assert abs(abs(error) - math.atan2(iron, north)) < math.radians(0.3)
+    assert 0.5 < abs(error) / sd < 1.5
+    calibrated = OrientationParams(mag_matrix_sd=0.0, mag_offset_sd=0.0)
+    rows = OrientationEstimator(calibrated).run(imu, mag)
+    assert math.sqrt(rows["cov_attitude"][-1][2, 2]) < math.radians(1.5)
