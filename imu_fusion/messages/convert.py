@@ -80,7 +80,7 @@ def pose_message(stamp, frame_id, quat_world_imu, position_world=(0.0, 0.0, 0.0)
     return POSE.encode(stamp, frame_id, [*position_world, *quat_world_imu])
 
 
-def orientation_message(row, frame_id, has_force):
+def orientation_message(row, frame_id, has_force=True):
     """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator.
 
     ``has_force``: whether the sensor measures specific force; if not it is absent.
