@@ -30,6 +30,7 @@ PARAMS = WHITE.replace(
 # The plane is thrown after some 15 s.
 LAGS, FLYING = 10, 20.0
 
+
 def load():
     """ImuLog, MagLog, FixLog, VelocityLog and the autopilot's attitude (stamp, quat), or None."""
     folder = data_path("px4_plane")
