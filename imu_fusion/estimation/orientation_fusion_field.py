@@ -14,6 +14,10 @@ from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix)
 
 _FIRST_FIELD_SD = 2e-3     # relative: noise of the field that the alignment averages
+_MAG_STATES = 17           # attitude (2), field, local, lag, offset (3), matrix (9)
+# Degrees of freedom of the residual's distribution. Few, since the errors of a field indoors
+# are no Gaussian's; from 3 to 9 nothing depends on it.
+_TAIL_DOF = 5.0
 
 
 @njit(cache=True)
@@ -52,7 +56,7 @@ def start_field(x, k, par, z, has_heading, follow):
             row[5 + c] = r[i, c] * follow
             for d in range(3):
                 row[8 + 3 * c + d] = r[i, c] * m[d] * follow
-        es.update(cov, error, 17, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+        es.update(cov, error, _MAG_STATES, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
     if has_heading and follow:
         for c in range(2):
             index[c], index[2 + c] = es.FIELD + c, es.LOCAL + c
@@ -141,7 +145,11 @@ def collect_mags(x, k, par, samples, count):
 
 @njit(cache=True)
 def update_mag(x, k, par, error, still, tape):
-    """The block's mean magnetometer sample against the field."""
+    """The block's mean magnetometer sample against the field.
+
+    Its noise is Student's t: the further the sample is from what was expected, the less
+    it weighs, however its norm may look.
+    """
     cov = x[COV:COV + N * N].reshape(N, N)
     count = k[BLOCK_MAGS]
     z = x[MAG_SUM:MAG_SUM + 3] / count
@@ -152,13 +160,27 @@ def update_mag(x, k, par, error, still, tape):
     sd = par[P_MAG_RELATIVE] + par[P_NORM_FACTOR] * deviation
     # White over 20 ms: faster sampling of the same disturbance is no news.
     variance = sd * sd * max(0.02 / time, 1.0 / count) + (par[st.P_MAG_SD] / x[NORM]) ** 2 / count
-    index = np.empty(es.OP_WIDTH, dtype=np.int64)
-    row = np.empty(es.OP_WIDTH)
+    index = np.empty((3, es.OP_WIDTH), dtype=np.int64)
+    row = np.empty((3, es.OP_WIDTH))
+    distance = 0.0
     for i in range(3):
-        _mag_row(i, expected, index, row)
-        row[4] = x[lag_row + i] / count
+        _mag_row(i, expected, index[i], row[i])
+        row[i, 4] = x[lag_row + i] / count
         for c in range(3):
-            row[5 + c] = x[offset_row + 3 * i + c] / count
+            row[i, 5 + c] = x[offset_row + 3 * i + c] / count
         for c in range(9):
-            row[8 + c] = x[soft_row + 9 * i + c] / count
-        es.update(cov, error, 17, index, row, z[i] - expected[i], variance, tape)
+            row[i, 8 + c] = x[soft_row + 9 * i + c] / count
+        distance += _distance(cov, error, index[i], row[i], z[i] - expected[i], variance)
+    variance *= (_TAIL_DOF + distance) / (_TAIL_DOF + 3.0)
+    for i in range(3):
+        es.update(cov, error, _MAG_STATES, index[i], row[i], z[i] - expected[i], variance, tape)
+
+
+@njit(cache=True)
+def _distance(cov, error, index, row, residual, variance):
+    """Squared innovation of one row over its variance."""
+    for a in range(_MAG_STATES):
+        residual -= row[a] * error[index[a]]
+        for b in range(_MAG_STATES):
+            variance += row[a] * row[b] * cov[index[a], index[b]]
+    return residual * residual / variance
