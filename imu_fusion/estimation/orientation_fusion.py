@@ -25,7 +25,7 @@ from numba import njit
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_detect import (
-    REST_MEMORY, find_limits, is_still, mean_rate)
+    REST_MEMORY, find_limits, is_still, mean_rate, start_limits)
 from imu_fusion.estimation.orientation_fusion_field import (
     collect_mags, start_field, update_mag)
 from imu_fusion.estimation.orientation_fusion_layout import (
@@ -70,8 +70,7 @@ def initialise(x, k, par, a):
     x[GRAVITY] = a.gravity
     x[HEADING_VAR] = st.UNIFORM_VARIANCE
     x[MEAN_RATE:MEAN_RATE + 3] = a.gyr_bias
-    x[LIMIT:LIMIT + 3] = np.where(np.isnan(par[st.P_RANGE:st.P_RANGE + 3]), np.inf,
-                                  par[st.P_RANGE:st.P_RANGE + 3])
+    start_limits(x, par)
     sd = np.zeros(N)
     sd[es.ATT:es.ATT + 2] = math.sqrt(a.cov_attitude_world[0, 0])
     sd[es.BIAS:es.SCALE] = max(a.gyr_bias_sd, 2e-4)
@@ -284,12 +283,12 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
         flags |= st.FLAG_NO_HEADING
     if stamp <= k[st.ALIGN_UNTIL]:
         flags |= st.FLAG_ALIGNING
-    _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, taken, row, row_int)
+    _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, taken, row, row_int)
     return result
 
 
 @njit(cache=True)
-def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, taken, row, row_int):
+def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, taken, row, row_int):
     """The output row of the present state."""
     cov = x[COV:COV + N * N].reshape(N, N)
     noise_dt = dt if dt > 0.0 else 1e-2
@@ -311,11 +310,9 @@ def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, taken, row, 
         force[i] = acc[i] - x[S + es.ACC_BIAS + i]
     cov_world[2, 2] += x[HEADING_VAR]
     rate = _rate(x, gyr)
-    if flags & st.FLAG_SATURATED:
-        for i in range(3):
-            limit = x[LIMIT + i]
-            if abs(gyr[i]) >= limit * (1.0 - 1e-6):
-                rate[i] = math.copysign(max(abs(rate[i]), limit), gyr[i])
+    for i in range(3):
+        if (clipped >> i) & 1:
+            rate[i] = math.copysign(max(abs(rate[i]), x[LIMIT + i]), gyr[i])
     st.write_row(row, row_int, par, stamp, x[st.Q:st.Q + 4], cov_world, rate, var_gyr,
                  force, par[st.P_ACC_DENSITY] ** 2 / noise_dt + cov[es.ACC_BIAS, es.ACC_BIAS],
                  x[S + es.BIAS:S + es.BIAS + 3], bias_var, mag, reliability, flags, taken)

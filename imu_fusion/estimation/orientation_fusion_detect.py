@@ -10,12 +10,19 @@ from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_layout import (
     COV, ENTRY, LARGEST, LIMIT, MEAN_FORCE, MEAN_RATE, N, P_REST_FORCE, P_REST_RATE,
     P_REST_TIME, REPEATED, REPEATS, REST_SINCE, S)
+from imu_fusion.sensors.saturation import LIMIT_TOLERANCE
 
 REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_TURN = 1.5e-3         # rad/s per axis: slower turning than 0.5 deg/s passes as rest
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
 _ENTRY_SHARE = 2e-3        # a flat top is run into; a quantised smooth peak is not
 _LIMIT_FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
+
+
+def start_limits(x, par):
+    """Limits that were given; those to be found are infinite until then."""
+    given = par[st.P_RANGE:st.P_RANGE + 3]
+    x[LIMIT:LIMIT + 3] = np.where(np.isnan(given), np.inf, given)
 
 
 @njit(cache=True)
@@ -31,17 +38,20 @@ def find_limits(x, k, par, gyr):
                 pass
             elif gyr[i] == x[REPEATED + i]:
                 k[REPEATS + i] += 1
-                if (k[REPEATS + i] >= _REPEATS_AT_LIMIT - 1 and size >= x[LARGEST + i]
+                if (k[REPEATS + i] >= _REPEATS_AT_LIMIT - 1
+                        and size >= x[LARGEST + i] * (1.0 - LIMIT_TOLERANCE)
                         and x[ENTRY + i] > _ENTRY_SHARE * size > _ENTRY_SHARE * _LIMIT_FLOOR):
                     x[LIMIT + i] = min(x[LIMIT + i], size)
             else:
                 k[REPEATS + i] = 0
                 x[ENTRY + i] = abs(gyr[i] - x[REPEATED + i])
-            x[LARGEST + i] = max(x[LARGEST + i], size)
-            if size > x[LIMIT + i]:
+            # Two samples in a row: a single wild one neither hides nor disproves a limit.
+            lasting = min(size, abs(x[REPEATED + i]))
+            x[LARGEST + i] = max(x[LARGEST + i], lasting)
+            if lasting > x[LIMIT + i] * (1.0 + LIMIT_TOLERANCE):
                 x[LIMIT + i] = np.inf    # a repeated value that was no limit
             x[REPEATED + i] = gyr[i]
-        if size >= x[LIMIT + i] * (1.0 - 1e-6):
+        if size >= x[LIMIT + i] * (1.0 - LIMIT_TOLERANCE):
             clipped |= 1 << i
     return clipped
 

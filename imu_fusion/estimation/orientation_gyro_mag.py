@@ -20,12 +20,13 @@ import numpy as np
 from numba import njit
 
 from imu_fusion.estimation import orientation_fusion as fusion
-from imu_fusion.estimation.orientation_fusion_layout import P_ESTIMATE_BIAS, P_REST_FORCE
+from imu_fusion.estimation.orientation_fusion_detect import find_limits, start_limits
+from imu_fusion.estimation.orientation_fusion_layout import LIMIT, P_ESTIMATE_BIAS, P_REST_FORCE
 from imu_fusion.estimation.orientation_state import (
     ALIGN_UNTIL, FIELD, FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING,
     FLAG_SATURATED, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, LAST_STAMP, MAG_USED,
     P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_GAP_RATE_SD, P_GYR_DENSITY,
-    P_MAG_SD, P_MAX_GAP, P_RANGE, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
+    P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
     TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
     take_mags, write_row)
 from imu_fusion.geometry.rotation import (
@@ -36,13 +37,17 @@ COV = fusion.X_SIZE            # (9, 9): attitude, bias, relative field
 N = 9
 X_SIZE = COV + N * N
 AS_PRINTED = fusion.K_SIZE     # 1: Winkler (9) and nothing else
-K_SIZE = AS_PRINTED + 1
+WAS_CLIPPED = AS_PRINTED + 1   # bits of the axes at their limit at the step's start
+K_SIZE = AS_PRINTED + 2
 P_FIELD_SD, P_FIELD_TIME = fusion.P_SIZE, fusion.P_SIZE + 1
 P_SIZE = P_FIELD_TIME + 1
 
 # Gauss-Newton converges quadratically from the gyroscope's own rotation; the
 # limit is reached only by steps of more than a radian.
 _ITERATIONS = 8
+# Weight of a gyroscope row that is left out. The field's rows outweigh it but within half a
+# degree of the field's own direction.
+_DROPPED = 0.01
 
 
 def pack(par, params):
@@ -58,6 +63,7 @@ def initialise(x, k, par, alignment):
     if par[P_ESTIMATE_BIAS]:
         fusion.initialise(x, k, par, alignment)
         return
+    start_limits(x, par)
     k[AS_PRINTED] = 1
     x[Q:Q + 4] = alignment.quat_world_imu
     x[U:U + 4] = 0.0, 0.0, 0.0, 1.0
@@ -90,11 +96,12 @@ def _inverse3(m):
 
 
 @njit(cache=True)
-def solve_step(rate, rate_next, dt, field, mag, weight, gain):
+def solve_step(rate, rate_next, dt, field, mag, weight, keep, gain):
     """Rotation over one step in the axes of its start: Winkler 2025 (9), Gauss-Newton.
 
     The paper writes (9) in world axes; turned into those of the step's start it
-    is the same least-squares problem with R_n = I.
+    is the same least-squares problem with R_n = I. There a gyroscope axis is a row, which
+    ``keep`` can leave out where the axis is at its limit (appendix B).
 
     Args:
         rate, rate_next: (3,) rad/s at both ends, each in its own imu axes.
@@ -102,6 +109,8 @@ def solve_step(rate, rate_next, dt, field, mag, weight, gain):
         field: (3,) expected field / B0, in the axes of the start.
         mag: (3,) measured field / B0, in the axes of the end.
         weight: w of (10), 0 without a sample.
+        keep: (3,) weight of each gyroscope axis: 1, or next to nothing. Not 0: a missing axis
+            along the field is in no other row.
         gain: (3, 3) out, attitude correction (axes of the start) per magnetic residual.
 
     Returns:
@@ -122,13 +131,13 @@ def solve_step(rate, rate_next, dt, field, mag, weight, gain):
         for i in range(3):
             for j in range(3):
                 a, b = (i + 1) % 3, (i + 2) % 3
-                j_gyr[i, j] = -dt * (rate_end[a] * left[b, j] - rate_end[b] * left[a, j])
+                j_gyr[i, j] = -dt * keep[i] * (rate_end[a] * left[b, j] - rate_end[b] * left[a, j])
                 j_mag[i, j] = -weight * (mag_start[a] * left[b, j] - mag_start[b] * left[a, j])
-            j_gyr[i, i] -= 2.0
+            j_gyr[i, i] -= 2.0 * keep[i]
         for i in range(3):
             rhs[i] = 0.0
             for m in range(3):
-                f_gyr = dt * (rate_end[m] + rate[m]) - 2.0 * phi[m]
+                f_gyr = keep[m] * (dt * (rate_end[m] + rate[m]) - 2.0 * phi[m])
                 f_mag = weight * (mag_start[m] - field[m])
                 rhs[i] -= j_gyr[m, i] * f_gyr + j_mag[m, i] * f_mag
             for j in range(3):
@@ -236,10 +245,9 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
         flags |= FLAG_GAP
         k[GAPS] += 1
         gap_variance = min((par[P_GAP_RATE_SD] * dt) ** 2, UNIFORM_VARIANCE)
-    for i in range(3):
-        if abs(gyr[i]) >= par[P_RANGE + i]:
-            flags |= FLAG_SATURATED
-    if flags & FLAG_SATURATED:
+    clipped = find_limits(x, k, par, gyr)
+    if clipped:
+        flags |= FLAG_SATURATED
         k[SATURATED] += 1
 
     # The step: gyroscope alone, or with the magnetometer samples that came.
@@ -262,10 +270,24 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
         weight = reliability
         unit_mag = mag / b0
         field = quat_rotate_inverse(quat, x[FIELD:FIELD + 3]) / b0
+    # A step has two ends, and at either an axis can be at its limit.
+    missing = (clipped | k[WAS_CLIPPED]) if weight > 0.0 else 0
+    k[WAS_CLIPPED] = clipped
+    keep = np.ones(3)
+    for i in range(3):
+        if (missing >> i) & 1:
+            keep[i] = _DROPPED
     gain = np.zeros((3, 3))
-    phi = solve_step(rate, rate_next, dt, field, unit_mag, weight, gain)
+    phi = solve_step(rate, rate_next, dt, field, unit_mag, weight, keep, gain)
     r = quat_to_matrix(quat_multiply(quat, quat_exp(0.5 * phi)))
     _propagate(cov, r, dt, par, gap_variance)
+    for m in range(3):
+        if ((clipped | missing) >> m) & 1:
+            # It may be as far beyond its limit as this is from zero.
+            unseen = (x[LIMIT + m] * dt) ** 2
+            for i in range(3):
+                for j in range(3):
+                    cov[i, j] += r[i, m] * r[j, m] * unseen
     x[Q:Q + 4] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
     if weight > 0.0:
         flags |= FLAG_MAG_USED
@@ -290,6 +312,10 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
     for i in range(3):
         bias_var[i] = cov[3 + i, 3 + i]
         var_gyr[i] = par[P_GYR_DENSITY] ** 2 / noise_dt + bias_var[i]
+        if (clipped >> i) & 1:
+            var_gyr[i] += x[LIMIT + i] ** 2
+            if weight > 0.0:
+                rate_next[i] = phi[i] / dt
     write_row(row, row_int, par, stamp, x[Q:Q + 4], cov[:3, :3], rate_next, var_gyr, acc,
               par[P_ACC_DENSITY] ** 2 / noise_dt + par[P_ACC_BIAS_SD] ** 2, bias, bias_var,
               mag, reliability, flags, taken)

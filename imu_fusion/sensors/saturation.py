@@ -9,10 +9,13 @@ import numpy as np
 
 from imu_fusion.errors import SampleError
 
+# The two ends of a range differ by a step (-32768, +32767), of 14 bits at the coarsest.
+LIMIT_TOLERANCE = 1.5e-4
+
 
 def saturated_axes(gyr, limit):
     """Mask (n, 3) of rates gyr (n, 3) rad/s at their limit, scalar or (3,) rad/s."""
-    return np.abs(gyr) >= np.asarray(limit, dtype=float) * (1.0 - 1e-6)
+    return np.abs(gyr) >= np.asarray(limit, dtype=float) * (1.0 - LIMIT_TOLERANCE)
 
 
 def recover_rates(stamp, gyr, mag, limit):

@@ -22,9 +22,11 @@ def errors_deg(rows, truth):
     return np.degrees(error.magnitude())
 
 
-@pytest.fixture(scope="module", params=["gyro_mag", "fusion"])
+@pytest.fixture(scope="module", params=[
+    dict(method="gyro_mag"), dict(method="gyro_mag", estimate_bias=False), dict(method="fusion")],
+    ids=["gyro_mag", "as printed", "fusion"])
 def params(request):
-    return OrientationParams(method=request.param)
+    return OrientationParams(**request.param)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from imu_fusion.estimation.orientation import OrientationEstimator, OrientationP
 from imu_fusion.estimation.orientation_state import (
     FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
 from imu_fusion.samples.logs import ImuLog, MagLog
+from imu_fusion.sensors.saturation import saturated_axes
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 
 MATRIX = ((1.004, 0.003, 0.0), (-0.002, 0.997, 0.001), (0.0, 0.003, 1.002))
@@ -220,13 +221,27 @@ def test_bursts_beyond_the_limit_are_solved():
         # The limit was not given: it is found from the first flat top.
         assert estimator.summary()["saturated"] > 0.9 * clipped.any(axis=1).sum()
     flagged = (result["causal"]["flags"] & FLAG_SATURATED) != 0
-    assert not flagged[~clipped.any(axis=1)].any()
+    assert not flagged[~saturated_axes(imu.gyr, 6.0).any(axis=1)].any()
     after = np.sqrt(((result["smoothed"]["gyr"] - rates)[clipped] ** 2).mean())
     assert after < 0.2 * before
     # Beside the same filter that takes clipped rates for true ones.
     blind = OrientationEstimator(OrientationParams(gyro_range=(1e3,))).run(imu, mag)
     assert rmse_deg(result["causal"], truth) < 0.4 * rmse_deg(blind, truth)
     assert rmse_deg(result["smoothed"], truth) < 0.4 * rmse_deg(result["causal"], truth)
+
+
+def test_one_wild_rate_does_not_hide_the_limit_and_both_ends_of_a_range_count():
+    """A range of 16 bits ends at -32768 and +32767."""
+    imu, mag, truth, _ = simulate(Tumbling(seed=21, rate_sd=5.0), 25.0, rate=200.0, seed=2,
+                                  sensors=Sensors(gyr_density=2e-4, gyr_limit=6.0))
+    gyr = np.minimum(imu.gyr, 6.0 * 32767 / 32768)
+    at_limit = np.abs(gyr) > 5.999
+    gyr[100, :] = 500.0
+    rows = OrientationEstimator().run(ImuLog(imu.stamp, gyr, imu.acc), mag)
+    flagged = (rows["flags"] & FLAG_SATURATED) != 0
+    # What comes before the fourth sample of the first flat top of each axis is not known.
+    assert flagged[at_limit.any(axis=1)][100:].all()
+    assert not flagged[~at_limit.any(axis=1)].any()
 
 
 def test_bias_estimation_can_be_switched_off(ordinary):
