@@ -78,7 +78,7 @@ def main():
             for seed in range(RUNS):
                 imu, mag, truth, declination = draw(seed)
                 out = OrientationEstimator(OrientationParams(
-                    mode=mode, axes_sd=0.0, heading_anchor=anchor,
+                    mode=mode, axes_sd=0.0, gyro_delay=0.0, heading_anchor=anchor,
                     declination_deg=declination)).run(imu, mag)
                 e = (Rotation.from_quat(out["quat_world_imu"]).inv()
                      * Rotation.from_quat(truth.quat_world_imu)).as_rotvec()

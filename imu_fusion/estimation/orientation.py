@@ -62,7 +62,7 @@ class OrientationParams(Parameters):
     gyro_range: tuple[float, ...] | None = param(
         None, unit="rad/s", low=1e-3, length=(1, 3),
         doc="Largest rate the gyroscope reports, one value or one per axis; unset: found "
-            "from flat tops (not by gyro_mag as printed).")
+            "from flat tops.")
     acc_noise_density: float = param(2e-3, unit="m/s^2/sqrt(Hz)", low=1e-9, high=10,
                                      doc="Accelerometer noise.")
     acc_bias_sd: float = param(0.05, unit="m/s^2", low=0, high=10,
@@ -87,8 +87,14 @@ class OrientationParams(Parameters):
                                 "to its norm.")
     field_time: float = param(20.0, unit="s", low=1e-3,
                               doc="gyro_mag as printed: time constant of that wander.")
-    gyro_delay: float = param(0.0, unit="s", low=-0.1, high=0.1,
-                             doc="How late rates and specific forces are stamped.")
+    gyro_delay: float | None = param(
+        None, unit="s", low=-0.1, high=0.1,
+        doc="How late rates and specific forces are stamped; these sensors alone cannot tell. "
+            "Unset: 0, give or take gyro_delay_sd.")
+    gyro_delay_sd: float = param(
+        0.004, unit="s", low=0, high=0.1,
+        doc="Standard deviation of a gyroscope delay that is not given, part of the attitude's "
+            "covariance while turning.")
     mag_delay: float | None = param(
         None, unit="s", low=-0.1, high=0.1,
         doc="How late a magnetometer sample is stamped; unset: estimated, except "
@@ -283,6 +289,11 @@ class OrientationEstimator:
         self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
         self._alignment = state["alignment"]
 
+    @property
+    def mag_saturated(self):
+        """How many magnetometer samples were refused with an axis at its limit."""
+        return int(self._k[st.MAG_SATURATED])
+
     def summary(self):
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
         k, x, a = self._k, self._x, self._alignment
@@ -304,7 +315,8 @@ class OrientationEstimator:
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
             **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", bias)},
-            gyro_delay=self.params.gyro_delay, mag_delay=self.params.gyro_delay + float(x[st.LAG]))
+            gyro_delay=self._par[st.P_GYR_DELAY],
+            mag_delay=self._par[st.P_GYR_DELAY] + float(x[st.LAG]))
 
     def _step(self, stamp):
         if self._next == _CHUNK:
@@ -378,7 +390,7 @@ class OrientationEstimator:
             declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
             gyr_density=p.gyro_noise_density, gyr_bias_sd=p.gyro_bias_sd,
             acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
-        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - p.gyro_delay
+        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - self._par[st.P_GYR_DELAY]
         self._kernel.initialise(self._x, self._k, par, self._alignment)
         self._k[st.ALIGN_UNTIL] = stamps[-1]
 
@@ -390,7 +402,8 @@ class OrientationEstimator:
 
     def _pack(self, p):
         par = np.zeros(self._kernel.P_SIZE)
-        par[st.P_GYR_DELAY] = p.gyro_delay
+        par[st.P_GYR_DELAY] = p.gyro_delay or 0.0
+        par[st.P_DELAY_SD] = p.gyro_delay_sd if p.gyro_delay is None else 0.0
         par[st.P_DECLINATION] = math.radians(p.declination_deg or 0.0)
         par[st.P_MAX_LAG] = p.max_mag_lag
         par[st.P_MAX_GAP] = p.max_gap

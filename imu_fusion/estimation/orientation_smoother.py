@@ -170,4 +170,5 @@ def _correct_row(row, par, error, cov, heading_var, saturated):
             for m in range(3):
                 for n in range(3):
                     total += r[m, i] * cov[m, n] * r[n, j]
-            row[st.ROW_COV + 3 * i + j] = total + (par[st.P_AXES_SD] ** 2 if i == j else 0.0)
+            row[st.ROW_COV + 3 * i + j] = total + st.unseen_cov(
+                par, row[st.ROW_GYR:st.ROW_GYR + 3], i, j)

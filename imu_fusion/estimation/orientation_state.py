@@ -92,7 +92,8 @@ P_IRON_OFFSET = 18  # (3,) tesla
 P_IRON_MATRIX = 21  # (9,) row by row
 P_AXES_SD = 30
 P_MAG_RANGE = 31   # (3,) tesla, nan if it is to be found
-P_COMMON = 34
+P_DELAY_SD = 34    # s, of the gyroscope's delay
+P_COMMON = 35
 TAKEN_WORDS = 10   # per magnetometer sample taken: field (3), rate (3), rotation (4)
 
 # What no sensor of this world reports, whatever its unit: a broken message.
@@ -261,6 +262,13 @@ def is_newer(k, stamp, sample):
 
 
 @njit(cache=True)
+def unseen_cov(par, rate, i, j):
+    """Element of the attitude's covariance, imu axes, that no filter on these sensors can see:
+    their axes in the case, and a delay of the rates, by which a turn of ``rate`` (3,) is late."""
+    return par[P_DELAY_SD] ** 2 * rate[i] * rate[j] + (par[P_AXES_SD] ** 2 if i == j else 0.0)
+
+
+@njit(cache=True)
 def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_acc,
               bias, bias_var, mag, reliability, flags, mag_count):
     """Write one ORIENTATION_DTYPE row through its float and integer views.
@@ -280,7 +288,7 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
             for m in range(3):
                 for n in range(3):
                     total += r[m, i] * cov_world[m, n] * r[n, j]
-            row[ROW_COV + 3 * i + j] = total + (par[P_AXES_SD] ** 2 if i == j else 0.0)
+            row[ROW_COV + 3 * i + j] = total + unseen_cov(par, gyr, i, j)
             row[ROW_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
             row[ROW_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
     for i in range(3):

@@ -8,6 +8,7 @@ import numpy as np
 from imu_fusion.errors import MessageError
 from imu_fusion.messages.convert import SAMPLE_TYPES, read_log
 from imu_fusion.messages.layouts import NANOSECONDS
+from imu_fusion.messages.orientation_status import FLAGS_TYPE
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 
 _HEADER = "std_msgs/msg/Header"
@@ -136,8 +137,9 @@ def _inspect_stamps(reader, name, info):
         else:
             stamps.append(log_time)
     stamps = np.array(stamps, dtype=np.int64)
-    # Without a header, messages may be sent at any time: gaps mean nothing.
-    findings = checks.check_stamps(stamps, name) if stamped else []
+    # Messages without a header, or about changes, are sent at any time: gaps mean nothing.
+    findings = [finding for finding in checks.check_stamps(stamps, name)
+                if stamped and (finding.kind != "gap" or info.msgtype != FLAGS_TYPE)]
     return TopicReport(name, info.msgtype, stamps, (), tuple(findings), stamped)
 
 

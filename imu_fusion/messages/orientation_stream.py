@@ -13,7 +13,9 @@ from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_rotate,
                                           quat_rotate_inverse)
 from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_message,
                                          orientation_message, rpy_message)
-from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, VECTOR3
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
+from imu_fusion.messages.orientation_status import (FLAGS_TYPE, bias_message, flags_message,
+                                                    lasting_flags)
 from imu_fusion.messages.streams import Stream
 from imu_fusion.parameters import Parameters, param
 from imu_fusion.samples import MagLog, checks
@@ -25,13 +27,17 @@ IMU_TOPIC = "imu/data_raw"
 ORIENTATION_TOPIC = "imu/data"
 RPY_TOPIC = "imu/rpy/filtered"
 STEADY_TOPIC = "imu/steady_state"
+FLAGS_TOPIC = "imu/flags"
+BIAS_TOPIC = "imu/gyro_bias"
 
 # At equal stamps in this order: an Imu sample uses the field of its own stamp.
 INPUTS = {FIX_TOPIC: SAMPLE_TYPES[FIX.msgtype], MAG_TOPIC: SAMPLE_TYPES[MAG.msgtype],
           IMU_TOPIC: GYROSCOPE_FIRST}
-OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TOPIC: BOOL_TYPE}
+OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TOPIC: BOOL_TYPE,
+           FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype}
 
 _UP = {"enu": 1.0, "nwu": 1.0, "ned": -1.0}  # z of the world frame's up
+_BIAS_INTERVAL = 100_000_000  # ns; a bias does not change faster
 _CALIBRATION_INTERVAL = 50_000_000  # ns; turning sensors show a new direction about as often
 
 
@@ -67,7 +73,8 @@ class _Writer:
     def __init__(self, params, output):
         self._up = _UP[params.world_frame]
         self._output = output
-        self._steady = None
+        self._flags = None
+        self._next_bias = None
         self.turn = 0.0
         self.yaw = None
 
@@ -80,13 +87,23 @@ class _Writer:
                 row = self._changed(row, has_force)
             yield ORIENTATION_TOPIC, stamp, orientation_message(row, frame_id, has_force)
             yield RPY_TOPIC, stamp, rpy_message(row, frame_id)
-            steady = bool(row["flags"] & FLAG_STILL)
-            if steady != self._steady:
-                self._steady = steady
-                yield STEADY_TOPIC, stamp, bool_message(steady)
+            flags = lasting_flags(int(row["flags"]), self._flags or 0)
+            if self._flags is None or (flags ^ self._flags) & FLAG_STILL:
+                yield STEADY_TOPIC, stamp, bool_message(bool(flags & FLAG_STILL))
+            if flags != self._flags:
+                self._flags = flags
+                yield FLAGS_TOPIC, stamp, flags_message(stamp, frame_id, flags)
+            if self._next_bias is None or stamp >= self._next_bias:
+                self._next_bias = stamp + _BIAS_INTERVAL
+                yield BIAS_TOPIC, stamp, bias_message(row, frame_id)
         if len(rows):
             east = quat_rotate(row["quat_world_imu"], np.array([1.0, 0.0, 0.0]))
             self.yaw = math.atan2(self._up * east[1], east[0])
+
+    def restart(self):
+        """What comes next is another stretch, perhaps at earlier stamps."""
+        self.turn = 0.0
+        self._next_bias = None
 
     def set_yaw(self, yaw):
         """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
@@ -153,7 +170,7 @@ class OrientationStream(Stream):
 
     def restart(self):
         self.estimator.reset()
-        self._writer.turn = 0.0
+        self._writer.restart()
         self._knows_north = False
         self._has_force = False
 
@@ -163,10 +180,12 @@ class OrientationStream(Stream):
             self._has_force |= bool(force.any())
             self._write(self.estimator.add_imu(stamp, sample[:3], force))
         elif topic == MAG_TOPIC:
-            if self._next_calibration is None or stamp >= self._next_calibration:
+            saturated = self.estimator.mag_saturated
+            self._write(self.estimator.add_mag(stamp, sample))
+            if (self.estimator.mag_saturated == saturated
+                    and (self._next_calibration is None or stamp >= self._next_calibration)):
                 self._calibrator.add(sample)
                 self._next_calibration = stamp + _CALIBRATION_INTERVAL
-            self._write(self.estimator.add_mag(stamp, sample))
         elif not self._knows_north:
             self._find_north(stamp, sample)
 
@@ -264,7 +283,7 @@ def run(logs, report, params, output):
     fix, fix_epochs = logs.get(FIX_TOPIC, (None, nothing))
     for epoch in np.union1d(imu_epochs, mag_epochs):
         estimator.reset()
-        writer.turn = 0.0
+        writer.restart()
         imu_part, mag_part = imu[imu_epochs == epoch], mag[mag_epochs == epoch]
         imu_part = replace(imu_part, acc=_without_lost(imu_part.acc, False))
         stamp, turn = _first_north(params, fix, fix_epochs == epoch)

@@ -64,18 +64,27 @@ class Panel:
     from_zero: bool = False
 
 
+@dataclass(frozen=True)
+class Shade:
+    """Spans [(start, end)] s that are marked in every panel; ``name`` is for the legend."""
+
+    name: str
+    spans: tuple
+    color: str = NEUTRAL
+    opacity: float = 0.11
+
+
 def plain(text):
     """Text from outside for plotly, which reads a subset of HTML in names and labels."""
     return html.escape(str(text), quote=False)
 
 
-def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
+def time_figure(panels, shades=(), panel_height=205):
     """Panels below each other over one time axis in seconds.
 
     Args:
         panels: list of Panel.
-        shaded: list of (start, end) s to be marked in every panel.
-        shaded_name: what they mean, for the legend.
+        shades: sequence of Shade.
         panel_height: pixels of one panel.
     """
     figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True,
@@ -95,8 +104,8 @@ def time_figure(panels, shaded=(), shaded_name="", panel_height=205):
                                   xshift=6, yref=f"y{row if row > 1 else ''} domain", y=0.04,
                                   xanchor="left", yanchor="bottom", font=dict(size=12),
                                   bgcolor="rgba(255,255,255,0.75)")
-    if len(shaded):
-        _shade(figure, shaded, shaded_name)
+    for shade in shades:
+        _shade(figure, shade, _duration(panels))
     style(figure, height=int(95 + panel_height * len(panels)))
     figure.update_layout(
         hovermode="x unified", hoverlabel=dict(font=dict(size=12)),
@@ -157,7 +166,7 @@ def _traces(item, named):
         x, y = _outline(*envelope(item.time, item.low, item.high), item.widest)
         if len(x) == 0:
             return []
-        red, green, blue = (int(item.color[i:i + 2], 16) for i in (1, 3, 5))
+        red, green, blue = _rgb(item.color)
         return [go.Scatter(
             x=_compact(x), y=_compact(y), mode="lines", line=dict(width=0),
             fill="toself", fillcolor=f"rgba({red},{green},{blue},{item.opacity})",
@@ -186,14 +195,43 @@ def _outline(time, low, high, widest):
     return np.concatenate(x), np.concatenate(y)
 
 
-def _shade(figure, shaded, name):
+def _duration(panels):
+    """Length of the time axis, s."""
+    times = [item.time for panel in panels for item in panel.items if len(item.time)]
+    return max(float(t[-1]) for t in times) - min(float(t[0]) for t in times) if times else 0.0
+
+
+def merged(spans, resolution):
+    """Spans in order, those less than ``resolution`` (s) apart as one, each at least as long."""
+    result = []
+    for start, end in sorted(spans):
+        end = max(end, start + resolution)
+        if result and start - result[-1][1] < resolution:
+            result[-1] = (result[-1][0], max(end, result[-1][1]))
+        else:
+            result.append((start, end))
+    return result
+
+
+def _shade(figure, shade, duration):
     # One trace draws the legend entry, shapes the areas: shapes span the panels at any zoom.
-    for start, end in shaded[:200]:
-        figure.add_vrect(x0=start, x1=end, fillcolor=NEUTRAL, opacity=0.11, line_width=0,
-                         layer="below", row="all", col=1)
+    # A thousandth of the axis is about a pixel.
+    spans = merged(shade.spans, duration / 1000.0)
+    if not spans:
+        return
+    shapes = [dict(type="rect", xref="x", yref="paper", x0=start, x1=end, y0=0, y1=1,
+                   fillcolor=shade.color, opacity=shade.opacity, line=dict(width=0),
+                   layer="below") for start, end in spans]
+    figure.update_layout(shapes=[*(figure.layout.shapes or ()), *shapes])
+    red, green, blue = _rgb(shade.color)
     figure.add_trace(go.Scatter(
-        x=[None], y=[None], mode="markers", name=name,
-        marker=dict(symbol="square", size=12, color="rgba(123,135,148,0.3)")), row=1, col=1)
+        x=[None], y=[None], mode="markers", name=shade.name,
+        marker=dict(symbol="square", size=12, color=f"rgba({red},{green},{blue},0.35)")),
+        row=1, col=1)
+
+
+def _rgb(color):
+    return tuple(int(color[i:i + 2], 16) for i in (1, 3, 5))
 
 
 def _compact(values):

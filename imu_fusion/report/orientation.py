@@ -65,8 +65,8 @@ def angle_panels(estimate, origin, reference=None, reference_name="reference"):
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
     panels = []
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        items = [Band("estimate, ±1σ", time, angles[:, i] - sd[:, i], angles[:, i] + sd[:, i],
-                      widest=180.0),
+        items = [Band("estimate, ±3σ", time, angles[:, i] - 3 * sd[:, i],
+                      angles[:, i] + 3 * sd[:, i], widest=180.0),
                  Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE)]
         if has_reference:
             items.append(Line(reference_name, ref_time, fig.break_wraps(ref_angles[:, i]),
@@ -94,12 +94,12 @@ def error_panels(errors, origin, word="error"):
     return panels
 
 
-def orientation_section(estimate, origin, reference=None, reference_name="reference", shaded=()):
+def orientation_section(estimate, origin, reference=None, reference_name="reference", shades=()):
     """Section with roll, pitch and yaw of an estimate beside a reference.
 
     Args:
         estimate, origin, reference: see :func:`angle_panels`.
-        shaded: [(start, end)] s in movement.
+        shades: sequence of Shade.
     """
     panels = angle_panels(estimate, origin, reference, reference_name)
     cov_world = orientation_error.attitude_cov_world(estimate.quat_world_imu,
@@ -113,14 +113,14 @@ def orientation_section(estimate, origin, reference=None, reference_name="refere
             Line(f"σ of {name}", time, np.degrees(sd), color) for name, sd, color in stated),
             from_zero=True))
     return Section("Orientation", (
-        Figure(time_figure(panels, shaded, _MOVING),
+        Figure(time_figure(panels, shades),
                "Roll, pitch and yaw of the sensor in east-north-up (REP 103: yaw counter-clockwise "
                "from east). Near a pitch of ±90° roll and yaw cannot be told apart and jump; "
                "errors are judged below without angles that can do that."),))
 
 
 def error_section(errors, origin, moving=None, reference_name="reference", is_truth=True,
-                  shaded=()):
+                  shades=()):
     """Section with the errors against a reference and their statistics.
 
     Args:
@@ -149,7 +149,7 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
         blocks += _honesty(errors, moving)
     panels = error_panels(errors, origin, word)
     blocks.append(Figure(
-        time_figure(panels, shaded, _MOVING),
+        time_figure(panels, shades),
         f"The {word} rotation in the axes of the world with the standard deviations that the "
         "estimator stated."))
     variance = errors.sd_world ** 2
@@ -162,7 +162,7 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
             Line(f"{word} angle", time, np.degrees(getattr(errors, name)), fig.ESTIMATE)),
             from_zero=True))
     blocks.append(Figure(
-        time_figure(panels, shaded, _MOVING, panel_height=160),
+        time_figure(panels, shades, panel_height=160),
         f"The {word} angles of the table; σ is the root of the sum of the variances involved, "
         "that is the RMS that the estimator expected."))
     return Section("Error against the reference" if is_truth
@@ -187,7 +187,7 @@ def _honesty(errors, moving):
                   f"{nees.mean():.2f}; 3 would be expected.")]
 
 
-def field_section(stamp, mag_world, origin, shaded=()):
+def field_section(stamp, mag_world, origin, shades=()):
     """Section with the magnetic field carried into the world by the estimate.
 
     Args:
@@ -213,14 +213,14 @@ def field_section(stamp, mag_world, origin, shaded=()):
                                     ("direction in °", azimuth))]
     return Section("Magnetic field", (
         Table(("quantity", "unit", "median", "5 %", "95 %", "standard deviation"), tuple(rows)),
-        Figure(time_figure(panels, shaded, _MOVING),
+        Figure(time_figure(panels, shades),
                "What the magnetometer measured, turned into the world by the estimated "
                "orientation. In an undisturbed field all three stand still. The strength does not "
                "depend on the orientation; inclination and direction do, and an estimator that "
                "steers by the field keeps them still.")))
 
 
-def motion_section(raw, corrected, origin, shaded=()):
+def motion_section(raw, corrected, origin, shades=()):
     """Section with angular rates and specific force.
 
     Args:
@@ -244,7 +244,7 @@ def motion_section(raw, corrected, origin, shaded=()):
         Line("norm", time, np.linalg.norm(log.acc, axis=1), fig.REFERENCE, width=1.0))))
     caption.append("The norm of the specific force is 9.81 m/s² at rest.")
     return Section("Angular rates and specific force", (
-        Figure(time_figure(panels, shaded, _MOVING), " ".join(caption)),))
+        Figure(time_figure(panels, shades), " ".join(caption)),))
 
 
 def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0, is_truth=True):

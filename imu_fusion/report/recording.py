@@ -15,13 +15,17 @@ from imu_fusion.messages.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
 from imu_fusion.messages.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
+from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.messages.orientation_stream import BIAS_TOPIC, FLAGS_TOPIC
 from imu_fusion.report.acceleration_field import field_sections
 from imu_fusion.report.field_data import read_field
-from imu_fusion.report.figures import intervals
+from imu_fusion.report.figures import Shade, intervals
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import Notes, Numbers, Section, Text, write_report
 from imu_fusion.report.orientation import (
     error_section, field_section, key_numbers, motion_section, orientation_section)
+from imu_fusion.report.orientation_status import Status, bias_section
+from imu_fusion.report.orientation_status import shades as status_shades
 from imu_fusion.report.overview import overview_section
 from imu_fusion.report.smoother import Smoothed, smoother_numbers, smoother_sections
 from imu_fusion.samples import seconds
@@ -79,23 +83,33 @@ def read_contents(path):
 
 
 def read_estimates(path):
-    """(AttitudeLog of imu/data or None, warnings) of a recording."""
+    """(AttitudeLog of imu/data or None, Status, warnings) of a recording."""
     warnings = []
     with open_bag(path) as reader:
+        cdrs = {name: [cdr for _, _, _, cdr in reader.messages([find_topic(reader.topics, name)])]
+                for name, msgtype in ((FLAGS_TOPIC, FLAGS_TYPE), (BIAS_TOPIC, TWIST.msgtype))
+                if _has(reader, name, msgtype)}
+        status = Status.from_messages(cdrs.get(FLAGS_TOPIC, ()), cdrs.get(BIAS_TOPIC, ()))
         if not _has(reader, ESTIMATES, IMU.msgtype):
-            return None, warnings
-        return _usable(read_log(reader, ESTIMATES, attitude_log), ESTIMATES, warnings), warnings
+            return None, status, warnings
+        log = _usable(read_log(reader, ESTIMATES, attitude_log), ESTIMATES, warnings)
+        return log, status, warnings
 
 
 def estimate_orientation(contents, params_file=None):
-    """AttitudeLog of the orientation estimator, from the recording's own samples; None if it
-    has no imu/data_raw."""
+    """(AttitudeLog, Status) of the orientation estimator, from the recording's own samples;
+    None if it has no imu/data_raw."""
     if RAW not in contents.logs:
-        return None
+        return None, Status.from_messages((), ())
     stage, params = stages()["orientation_estimator"].prepare(params_file)
     messages = stage.run(contents.samples(stage.required | stage.optional),
                          StageReport(stage.node, params), *params)
-    return attitude_log([cdr for topic, _, cdr in messages if topic == ESTIMATES])
+    cdrs = {topic: [] for topic in (ESTIMATES, FLAGS_TOPIC, BIAS_TOPIC)}
+    for topic, _, cdr in messages:
+        if topic in cdrs:
+            cdrs[topic].append(cdr)
+    return (attitude_log(cdrs[ESTIMATES]),
+            Status.from_messages(cdrs[FLAGS_TOPIC], cdrs[BIAS_TOPIC]))
 
 
 def smooth_recording(contents, params_file=None):
@@ -137,9 +151,10 @@ def write_recording_report(bag, estimates, path, params_file=None):
     """
     contents = read_contents(bag)
     source = bag if estimates is None else estimates
-    estimate, warnings = read_estimates(source)
+    estimate, status, warnings = read_estimates(source)
     if estimate is None and estimates is None:
-        estimate, estimates = estimate_orientation(contents, params_file), "this report's own run"
+        estimate, status = estimate_orientation(contents, params_file)
+        estimates = "this report's own run"
     smoothed, reason = smooth_recording(contents, params_file)
     warnings = [*contents.warnings, *warnings]
     raw, mag = contents.log(RAW), contents.log(MAGNETOMETER)
@@ -149,10 +164,12 @@ def write_recording_report(bag, estimates, path, params_file=None):
                   if log is not None and len(log)), None)
     origin = contents.start if clock is None else int(clock.stamp[0])
     errors = moving = None
-    shaded = ()
+    shades = []
     if contents.changes is not None and clock is not None:
-        shaded = intervals(seconds(clock.stamp, origin),
-                           moving_at(clock.stamp, *contents.changes))
+        shades = [Shade("in movement", tuple(intervals(
+            seconds(clock.stamp, origin), moving_at(clock.stamp, *contents.changes))))]
+    if estimate is not None:
+        shades += status_shades(status, origin, int(estimate.stamp[-1]), with_rest=not shades)
     if estimate is not None and reference is not None:
         errors = orientation_errors(estimate.stamp, estimate.quat_world_imu, reference,
                                     estimate.cov_attitude)
@@ -188,16 +205,18 @@ def write_recording_report(bag, estimates, path, params_file=None):
         sections += smoother_sections(smoothed, reference if in_world else None)
     if estimate is not None:
         sections.append(orientation_section(estimate, origin, reference,
-                                            contents.reference_name or "", shaded))
+                                            contents.reference_name or "", shades))
     if errors is not None:
         sections.append(error_section(errors, origin, moving, contents.reference_name, is_truth,
-                                      shaded))
+                                      shades))
+    if len(status.bias):
+        sections.append(bias_section(status, origin, shades))
     if field is not None:
         sections += field_sections(field, origin)
     if estimate is not None and mag is not None:
-        sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shaded))
+        sections.append(field_section(mag.stamp, carry(mag, estimate), origin, shades))
     if raw is not None or estimate is not None:
-        sections.append(motion_section(raw, estimate, origin, shaded))
+        sections.append(motion_section(raw, estimate, origin, shades))
     if FIX_TOPIC in contents.logs:
         sections.append(gnss_section(contents.log(FIX_TOPIC), contents.log(VELOCITY_TOPIC),
                                      origin))

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother.inputs import evaluate_constraints
 from imu_fusion.report import figures as fig
-from imu_fusion.report.figures import Band, Line, Panel, time_figure
+from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Section, Table, Text
 from imu_fusion.report.orientation import angle_panels
 from imu_fusion.report.overview import number
@@ -152,15 +152,16 @@ def _jump(smoothed):
 
 
 def _flight(smoothed):
-    """[(start, end)] s in the air, for shading."""
+    """The flight as a Shade, if there is one."""
     events = smoothed.result.events
     if events is None:
         return ()
-    return [tuple(float(seconds(s, smoothed.origin)) for s in (events.takeoff, events.touchdown))]
+    span = tuple(float(seconds(s, smoothed.origin)) for s in (events.takeoff, events.touchdown))
+    return (Shade("in the air", (span,)),)
 
 
 def _figure(smoothed, panels, caption="", **options):
-    return Figure(time_figure(panels, _flight(smoothed), "in the air", **options), caption)
+    return Figure(time_figure(panels, _flight(smoothed), **options), caption)
 
 
 def _banded(time, values, sd, name, color=fig.ESTIMATE, label="±3σ"):

@@ -11,6 +11,7 @@ from imu_fusion.estimation.orientation import (
     ORIENTATION_DTYPE, OrientationEstimator, OrientationParams)
 from imu_fusion.estimation.orientation_alignment import triad
 from imu_fusion.estimation.orientation_state import FLAG_ALIGNING, FLAG_GAP
+from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 
 NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
@@ -178,3 +179,23 @@ def test_rows_have_the_promised_layout(params, recording):
 def test_parameters_are_refused_by_name():
     with pytest.raises(ParameterError, match="gyro_range"):
         OrientationParams(gyro_range=(1.0, 2.0))
+
+
+def test_a_delay_that_is_not_given_is_part_of_the_covariance_while_turning():
+    """Rates that are 4 ms late: no estimator can tell, but it can say so."""
+    imu, mag, truth, _ = simulate(Tumbling(seed=1, rate_sd=3.0), 20.0, rate=200.0, sensors=NOISY,
+                                  seed=2)
+    later = int(4e6)
+    imu = ImuLog(imu.stamp + later, imu.gyr, imu.acc)
+    mag = MagLog(mag.stamp + later, mag.mag)
+    shares = {}
+    for name, changes in (("unset", {}), ("wrong", dict(gyro_delay=0.0)),
+                          ("given", dict(gyro_delay=0.004))):
+        rows = OrientationEstimator(OrientationParams(axes_sd=1e-3, **changes)).run(imu, mag)
+        want = simulate(Tumbling(seed=1, rate_sd=3.0), 20.0, rate=200.0, seed=2)[2]
+        want = Rotation.from_quat(want.quat_world_imu) * Rotation.from_rotvec(0.004 * rows["gyr"])
+        error = (Rotation.from_quat(rows["quat_world_imu"]).inv() * want).as_rotvec()
+        fast = np.linalg.norm(rows["gyr"], axis=1) > 4.0
+        distance = np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_attitude"]), error)
+        shares[name] = (distance[fast] < 14.16).mean()    # 3 sigma of three degrees of freedom
+    assert shares["unset"] > 0.99 and shares["given"] > 0.99 and shares["wrong"] < 0.9

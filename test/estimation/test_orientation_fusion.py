@@ -95,7 +95,7 @@ def test_covariance_is_honest(mode):
         imu, mag, truth, _ = simulate(Tumbling(seed=seed), 20.0, rate=100.0, sensors=sensors,
                                       seed=seed)
         rows = OrientationEstimator(OrientationParams(
-            mode=mode, axes_sd=0.0, heading_anchor="field")).run(imu, mag)
+            mode=mode, axes_sd=0.0, gyro_delay=0.0, heading_anchor="field")).run(imu, mag)
         d = local_errors(rows, truth)
         distances.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(rows["cov_attitude"]), d))
     distances = np.concatenate(distances)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistWithCovarianceStamped, Vector3Stamped
 from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu, MagneticField
@@ -16,13 +17,15 @@ from imu_fusion.errors import ParameterError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, MAG, VECTOR3
+from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value
 from imu_fusion.messages.orientation_stream import OUTPUTS as TYPES
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from test.nodes.conftest import START, STEP, collector
 
-OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool}
+OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool,
+           "/imu/flags": DiagnosticArray, "/imu/gyro_bias": TwistWithCovarianceStamped}
 NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
 
 
@@ -61,6 +64,8 @@ def write(path, imu, mag, faults=True):
 def fields(topic, cdr):
     """All decoded fields of a message, as bytes so that NaN equals itself."""
     msgtype = TYPES[topic.lstrip("/")]
+    if msgtype == FLAGS_TYPE:
+        return flags_value(bytes(cdr))
     if msgtype not in LAYOUTS:
         return bytes(cdr[4:5])
     stamp, frame_id, values = LAYOUTS[msgtype].decode(cdr)

@@ -14,7 +14,10 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import ImuFusionError, TopicError
 from imu_fusion.messages.bag import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message, pose_message
-from imu_fusion.report.figures import Band, Line, Panel, break_wraps, intervals, time_figure
+from imu_fusion.report.figures import (
+    Band, Line, Panel, Shade, break_wraps, intervals, merged, time_figure)
+from imu_fusion.report.orientation_status import Status
+from imu_fusion.report.orientation_status import shades as status_shades
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import (
     Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
@@ -138,13 +141,35 @@ def test_hours_of_data_give_a_page_of_bounded_size():
 
 def test_time_axes_are_one_and_all_panels_are_labelled():
     line = Line("a", np.arange(5.0), np.arange(5.0), "#123456")
-    figure = time_figure([Panel("u in V", (line,)), Panel("i in A", (line,))], [(1.0, 2.0)], "on")
+    figure = time_figure([Panel("u in V", (line,)), Panel("i in A", (line,))],
+                         [Shade("on", ((1.0, 2.0),))])
     assert figure.layout.xaxis.matches == figure.layout.xaxis2.matches == "x"
     labels = {a.text for a in figure.layout.annotations}
     assert labels == {"u in V", "i in A"}
     assert "time" in figure.layout.xaxis2.title.text
     # One legend entry per name, however many panels it is in.
     assert [t.name for t in figure.data if t.showlegend is not False] == ["a", "on"]
+
+
+def test_shaded_spans_stay_few_and_none_is_lost():
+    # Ten thousand flickers become one span; a single sample keeps the width of a pixel.
+    flicker = [(0.01 * i, 0.01 * i + 0.005) for i in range(10_000)]
+    assert merged([*flicker, (900.0, 900.0)], 1.0) == [(0.0, pytest.approx(100.99)), (900.0, 901.0)]
+    line = Line("a", np.arange(1000.0), np.arange(1000.0), "#123456")
+    shades = [Shade("one", tuple(flicker)), Shade("two", ((1.0, 2.0), (500.0, 600.0))),
+              Shade("none", ())]
+    figure = time_figure([Panel("u", (line,))] * 3, shades)
+    assert len(figure.layout.shapes) == 3
+    assert [t.name for t in figure.data if t.showlegend is not False] == ["a", "one", "two"]
+
+
+def test_spans_of_flags_hold_until_the_next_change():
+    stamp = np.array([0, 1, 3, 4], dtype=np.int64) * 1_000_000_000
+    status = Status(stamp, np.array([1, 4, 4 | 8, 0]), stamp[:0], np.empty((0, 3)),
+                    np.empty((0, 3)))
+    found = {s.name: s.spans for s in status_shades(status, 0, 9_000_000_000)}
+    assert found == {"at rest": ((0.0, 1.0),), "magnetic disturbance": ((1.0, 3.0), (3.0, 4.0)),
+                     "sensor at its limit": ((3.0, 4.0),)}
 
 
 def test_a_band_breaks_where_it_wraps_or_is_not_determined():

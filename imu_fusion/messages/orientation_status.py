@@ -1,0 +1,81 @@
+"""What the orientation estimator says about itself beside the orientation.
+
+Flags as a diagnostic_msgs/DiagnosticArray, published when they change: a stamped message that
+a person can read on the command line and a report can shade spans from. The gyroscope's
+bias as a geometry_msgs/TwistWithCovarianceStamped.
+"""
+
+import numpy as np
+from rosbags.typesys.stores.ros2_jazzy import (
+    builtin_interfaces__msg__Time as Time,
+    diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
+    diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
+    diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
+
+from imu_fusion.errors import MessageError
+from imu_fusion.estimation import orientation_state as st
+from imu_fusion.messages.bag import TYPES
+from imu_fusion.messages.layouts import NANOSECONDS, TWIST
+
+FLAGS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
+_NAME = "orientation"
+
+# Flags that last, by the word that stands for them; those that worry last.
+WORDS = {st.FLAG_ALIGNING: "aligning", st.FLAG_STILL: "at rest",
+         st.FLAG_NO_HEADING: "heading unknown", st.FLAG_MAG_DISTURBED: "magnetic disturbance",
+         st.FLAG_MAG_SATURATED: "magnetometer at its limit",
+         st.FLAG_SATURATED: "gyroscope at its limit", st.FLAG_GAP: "samples missing"}
+_WORRIES = ~(st.FLAG_ALIGNING | st.FLAG_STILL)
+_MAG_FLAGS = st.FLAG_MAG_DISTURBED | st.FLAG_MAG_SATURATED
+_MAG_SEEN = _MAG_FLAGS | st.FLAG_MAG_USED
+
+
+def lasting_flags(flags, before):
+    """The flags of a row that are in ``WORDS``; what a magnetometer sample showed lasts until
+    the next one. before: the result for the row before."""
+    if not flags & _MAG_SEEN:
+        flags |= before & _MAG_FLAGS
+    return flags & sum(WORDS)
+
+
+def flags_message(stamp, frame_id, flags):
+    """CDR bytes of a diagnostic_msgs/DiagnosticArray. stamp: int ns; flags: of WORDS."""
+    words = [word for flag, word in WORDS.items() if flags & flag]
+    status = DiagnosticStatus(
+        level=int(bool(flags & _WORRIES)), name=_NAME, message=", ".join(words) or "in motion",
+        hardware_id=frame_id,
+        values=[KeyValue(key=word, value=str(bool(flags & flag))) for flag, word in WORDS.items()])
+    header = Header(stamp=Time(*divmod(stamp, NANOSECONDS)), frame_id=frame_id)
+    return bytes(TYPES.serialize_cdr(DiagnosticArray(header=header, status=[status]), FLAGS_TYPE))
+
+
+def flags_value(cdr):
+    """(stamp int ns, flags) of a message of :func:`flags_message`.
+
+    Raises:
+        MessageError: the bytes are no DiagnosticArray.
+    """
+    try:
+        message = TYPES.deserialize_cdr(cdr, FLAGS_TYPE)
+    except Exception as error:  # the library raises whatever the bytes lead it to
+        raise MessageError(f"{FLAGS_TYPE}: {len(cdr)} bytes that cannot be read ({error})") from None
+    true = {v.key for s in message.status if s.name == _NAME for v in s.values if v.value == "True"}
+    stamp = message.header.stamp
+    return (stamp.sec * NANOSECONDS + stamp.nanosec,
+            sum(flag for flag, word in WORDS.items() if word in true))
+
+
+def bias_message(row, frame_id):
+    """CDR bytes of the geometry_msgs/TwistWithCovarianceStamped with the gyroscope bias of one
+    row as its angular part, rad/s in imu axes; the linear part is absent."""
+    cov = np.zeros((6, 6))
+    cov[0, 0] = -1.0
+    cov[3:, 3:] = np.diag(row["gyr_bias_sd"] ** 2)
+    return TWIST.encode(row["stamp"], frame_id, [0.0, 0.0, 0.0, *row["gyr_bias"], *cov.ravel()])
+
+
+def bias_values(messages):
+    """Stamps (n,) int64 ns, biases and standard deviations (n, 3) rad/s of bias messages."""
+    stamp, _, values = TWIST.decode_many(messages)
+    variance = np.diagonal(values[:, TWIST["covariance"]].reshape(-1, 6, 6), axis1=1, axis2=2)
+    return stamp, values[:, TWIST["angular"]], np.sqrt(np.maximum(variance[:, 3:], 0.0))
