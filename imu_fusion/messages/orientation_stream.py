@@ -51,6 +51,9 @@ class OrientationOutputParams(Parameters):
                            doc="Gravity that remove_gravity_vector takes out.")
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
+    publish_tf: bool = param(False, doc="Also broadcast the orientation as the transform from "
+                                        "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
+    fixed_frame: str = param("odom", doc="Parent frame of that transform.")
 
 
 def _without_lost(acc, had_force):

@@ -3,15 +3,45 @@
 import math
 
 import yaml
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
 from std_srvs.srv import Trigger
 
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.errors import ImuFusionError, ParameterError
 from imu_fusion.estimation.orientation import OrientationParams
-from imu_fusion.messages.orientation_stream import (OUTPUTS, OrientationOutputParams,
-                                                    OrientationStream, warm_up)
+from imu_fusion.messages.layouts import IMU, NANOSECONDS
+from imu_fusion.messages.orientation_stream import (ORIENTATION_TOPIC, OUTPUTS,
+                                                    OrientationOutputParams, OrientationStream,
+                                                    warm_up)
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
+
+
+def transform_broadcast(node, output):
+    """The function that broadcasts a TransformStamped.
+
+    Raises:
+        ParameterError: tf2_ros is not installed.
+    """
+    try:
+        from tf2_ros import TransformBroadcaster
+    except ImportError as error:
+        raise ParameterError("parameter 'publish_tf': true needs tf2_ros, which is not here "
+                             f"({error}); with an apt ROS: apt install ros-jazzy-tf2-ros-py, "
+                             "else set publish_tf false") from None
+    return TransformBroadcaster(node).sendTransform
+
+
+def transform(cdr, fixed_frame):
+    """The geometry_msgs/TransformStamped from ``fixed_frame`` to an Imu message's frame."""
+    stamp, frame_id, values = IMU.decode(cdr)
+    message = TransformStamped(child_frame_id=frame_id)
+    message.header.frame_id = fixed_frame
+    message.header.stamp = Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
+    r = message.transform.rotation
+    r.x, r.y, r.z, r.w = values[IMU["orientation"]].tolist()
+    return message
 
 
 class OrientationEstimatorNode(EstimatorNode):
@@ -26,14 +56,21 @@ class OrientationEstimatorNode(EstimatorNode):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
+        output = self.params(OrientationOutputParams)
+        self._broadcast = transform_broadcast(self, output) if output.publish_tf else None
         warm_up(self.params(OrientationParams))
         self.attach(OrientationStream(
-            self.params(OrientationParams), self.params(OrientationOutputParams), self.emit,
+            self.params(OrientationParams), output, self.emit,
             self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
             self.create_service(Trigger, f"~/{name}",
                                 lambda _, response, action=action: self._answer(response, action))
+
+    def emit(self, topic, stamp, cdr):
+        super().emit(topic, stamp, cdr)
+        if self._broadcast is not None and topic == ORIENTATION_TOPIC:
+            self._broadcast(transform(cdr, self.params(OrientationOutputParams).fixed_frame))
 
     def summary(self):
         return self._stream.estimator.summary()
