@@ -15,6 +15,7 @@ from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_alignment import align, usable_mags
+from imu_fusion.estimation.orientation_lag import FixedLag
 from imu_fusion.estimation.orientation_smoother import smooth
 from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
 from imu_fusion.parameters import Parameters, param
@@ -38,6 +39,9 @@ class OrientationParams(Parameters):
                             "Winkler 2025 as printed.")
     mode: str = param("causal", choices=("causal", "smoothed"),
                       doc="smoothed: run() on a whole recording also looks ahead (fusion only).")
+    lag: float = param(0.0, unit="s", low=0, high=10,
+                       doc="fusion, causal: rows come once more, corrected by what is seen one to two "
+                           "times this later; 0: they do not.")
     world_frame: str = param("enu", choices=("enu", "ned", "nwu"),
                              doc="World axes of the published orientation.")
     declination_deg: float | None = param(
@@ -152,6 +156,9 @@ class OrientationParams(Parameters):
         if self.mode == "smoothed" and self.method != "fusion":
             raise ParameterError("parameter 'mode': 'smoothed' needs method 'fusion', "
                                  f"not '{self.method}'")
+        if self.lag and (self.method, self.mode) != ("fusion", "causal"):
+            raise ParameterError("parameter 'lag': needs method 'fusion' and mode 'causal', not "
+                                 f"'{self.method}' and '{self.mode}'")
 
 
 def _axes(value, default):
@@ -198,6 +205,7 @@ class OrientationEstimator:
         self._waiting = []
         self._waiting_imus = 0
         self._alignment = None
+        self._lag = FixedLag(self.params.lag) if self.params.lag else None
 
     def add_imu(self, stamp, gyr, acc):
         """Take one Imu sample.
@@ -224,13 +232,23 @@ class OrientationEstimator:
                 self._k[st.MAG_REJECTED] += 1
         else:
             self._kernel.push_mag(self._x, self._k, self._par, stamp, self._mag)
+            if self._lag is not None:
+                self._lag.add((), None, np.array([stamp]), self._mag.copy()[None])
         return self._chunk[:0]
 
     def finish(self):
         """The end of the stream: rows that still wait for the alignment."""
+        rows = self._chunk[:0]
         if self._alignment is None and self._waiting_imus:
-            return self._start()
-        return self._chunk[:0]
+            rows = self._start()
+        if self._lag is not None:
+            self._lag.finish(self._par)
+        return rows
+
+    def take_corrected(self):
+        """Rows corrected by looking ahead (parameter ``lag``) since the last call; the last
+        ones come with :meth:`finish`."""
+        return self._chunk[:0] if self._lag is None else self._lag.take()
 
     def run(self, imu, mag=None):
         """Whole logs: the same as add_imu and add_mag in merge order, in one compiled loop.
@@ -272,7 +290,8 @@ class OrientationEstimator:
     def get_state(self):
         """A snapshot for :meth:`set_state`: going on from it changes nothing."""
         return dict(x=self._x.copy(), k=self._k.copy(), waiting=list(self._waiting),
-                    alignment=self._alignment)
+                    alignment=self._alignment,
+                    lag=None if self._lag is None else self._lag.copy())
 
     def set_state(self, state):
         """Go on from a snapshot of an estimator with the same parameters.
@@ -288,6 +307,7 @@ class OrientationEstimator:
         self._waiting = list(state["waiting"])
         self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
         self._alignment = state["alignment"]
+        self._lag = None if state["lag"] is None else state["lag"].copy()
 
     @property
     def mag_saturated(self):
@@ -321,6 +341,10 @@ class OrientationEstimator:
     def _step(self, stamp):
         if self._next == _CHUNK:
             self._new_chunk()
+        if self._lag is not None:
+            if stamp >= self._lag.border:
+                self._lag.cross(stamp, self._x, self._k, self._par)
+            self._lag.add(np.array([stamp]), self._sample.copy()[None], (), None)
         i = self._next
         if not self._kernel.step_imu(self._x, self._k, self._par, stamp, self._sample,
                                      self._floats[i], self._ints[i]):
@@ -395,6 +419,26 @@ class OrientationEstimator:
         self._k[st.ALIGN_UNTIL] = stamps[-1]
 
     def _run_kernel(self, stamps, samples, mag_stamps, mags):
+        if self._lag is None:
+            return self._run_window(stamps, samples, mag_stamps, mags)
+        parts = []
+        i = j = 0
+        while i < len(stamps) or j < len(mag_stamps):
+            if i < len(stamps) and stamps[i] >= self._lag.border:
+                self._lag.cross(int(stamps[i]), self._x, self._k, self._par)
+            beyond = np.flatnonzero(stamps[i:] >= self._lag.border)
+            end = i + int(beyond[0]) if len(beyond) else len(stamps)
+            # A magnetometer sample comes before the Imu sample of its own stamp.
+            end_mag = (np.searchsorted(mag_stamps, stamps[end], side="right")
+                       if end < len(stamps) else len(mag_stamps))
+            end_mag = max(end_mag, j)
+            window = (stamps[i:end], samples[i:end], mag_stamps[j:end_mag], mags[j:end_mag])
+            parts.append(self._run_window(*window))
+            self._lag.add(*window)
+            i, j = end, end_mag
+        return np.concatenate([self._chunk[:0], *parts])
+
+    def _run_window(self, stamps, samples, mag_stamps, mags):
         rows = np.zeros(len(stamps), ORIENTATION_DTYPE)
         written = self._kernel.run_loop(self._x, self._k, self._par, stamps, samples,
                                         mag_stamps, mags, *_views(rows))

@@ -29,7 +29,7 @@ from imu_fusion.estimation.orientation_fusion_detect import (
 from imu_fusion.estimation.orientation_fusion_field import (
     collect_mags, start_field, update_mag)
 from imu_fusion.estimation.orientation_fusion_layout import (
-    ACC_LAST, BLOCK_MAGS, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT, MAG_ROWS, MAG_SUM,
+    ACC_LAST, BLOCK_MAGS, BLOCK_START, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT, MAG_ROWS, MAG_SUM,
     MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK, P_ESTIMATE_BIAS, P_EXCESS_WALK,
     P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD,
     P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD, P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME,
@@ -178,6 +178,7 @@ def _end_block(x, k, par, still, back, tape):
         tape[es.TAPE_COV:es.TAPE_COV + N * N] = x[COV:COV + N * N]
         tape[es.TAPE_TURNED] = k[WORLD_TURNED]
     k[WORLD_TURNED] = 0
+    k[BLOCK_START] = k[st.LAST_STAMP]
     x[MOVE:MOVE + es.MOVE_SIZE] = 0.0
     x[MAG_SUM:MAG_SUM + MAG_ROWS] = 0.0
     k[BLOCK_MAGS] = 0

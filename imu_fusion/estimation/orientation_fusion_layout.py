@@ -31,7 +31,8 @@ CLIPPED = BLOCK_MAGS + 2   # bit per axis at its limit
 WAS_CLIPPED = BLOCK_MAGS + 3  # the same in the block before
 REPEATS = BLOCK_MAGS + 4   # (3,) how often each axis repeated its largest value
 WORLD_TURNED = REPEATS + 3  # the heading was fixed in this block
-K_SIZE = WORLD_TURNED + 1
+BLOCK_START = WORLD_TURNED + 1  # stamp of the last block's end
+K_SIZE = BLOCK_START + 1
 
 # Parameters.
 (P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,

@@ -50,7 +50,7 @@ def smooth(x, k, par, stamps, samples, mag_stamps, mags, rows, rows_int):
     information = np.zeros((N, N))
     end = written
     for x0, k0, i, j, first in reversed(snapshots):
-        cov0, stamp0 = x0[fusion.COV:fusion.COV + N * N].copy(), k0[st.LAST_STAMP]
+        cov0, stamp0 = x0[fusion.COV:fusion.COV + N * N].copy(), k0[fusion.BLOCK_START]
         _, _, _, blocks = _forward(x0, k0, par, stamps, samples, mag_stamps, mags, i, j, first,
                                    rows, rows_int, tapes, block_stamps, block_of_row)
         _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, end,

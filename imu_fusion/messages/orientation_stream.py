@@ -29,12 +29,13 @@ RPY_TOPIC = "imu/rpy/filtered"
 STEADY_TOPIC = "imu/steady_state"
 FLAGS_TOPIC = "imu/flags"
 BIAS_TOPIC = "imu/gyro_bias"
+SMOOTHED_TOPIC = "imu/data_smoothed"
 
 # At equal stamps in this order: an Imu sample uses the field of its own stamp.
 INPUTS = {FIX_TOPIC: SAMPLE_TYPES[FIX.msgtype], MAG_TOPIC: SAMPLE_TYPES[MAG.msgtype],
           IMU_TOPIC: GYROSCOPE_FIRST}
 OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TOPIC: BOOL_TYPE,
-           FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype}
+           FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype, SMOOTHED_TOPIC: IMU.msgtype}
 
 _UP = {"enu": 1.0, "nwu": 1.0, "ned": -1.0}  # z of the world frame's up
 _BIAS_INTERVAL = 100_000_000  # ns; a bias does not change faster
@@ -85,10 +86,8 @@ class _Writer:
         """Yield (topic, stamp, cdr)."""
         for row in rows:
             stamp = int(row["stamp"])
-            has_force = bool(row["acc"].any())   # zero: a gyroscope without an accelerometer
-            if self.turn or self._output.remove_gravity_vector:
-                row = self._changed(row, has_force)
-            yield ORIENTATION_TOPIC, stamp, orientation_message(row, frame_id, has_force)
+            row, message = self._orientation(row, frame_id)
+            yield ORIENTATION_TOPIC, stamp, message
             yield RPY_TOPIC, stamp, rpy_message(row, frame_id)
             flags = lasting_flags(int(row["flags"]), self._flags or 0)
             if self._flags is None or (flags ^ self._flags) & FLAG_STILL:
@@ -103,6 +102,11 @@ class _Writer:
             east = quat_rotate(row["quat_world_imu"], np.array([1.0, 0.0, 0.0]))
             self.yaw = math.atan2(self._up * east[1], east[0])
 
+    def corrected(self, rows, frame_id):
+        """Yield (topic, stamp, cdr) of rows that looking ahead has corrected."""
+        for row in rows:
+            yield SMOOTHED_TOPIC, int(row["stamp"]), self._orientation(row, frame_id)[1]
+
     def restart(self):
         """What comes next is another stretch, perhaps at earlier stamps."""
         self.turn = 0.0
@@ -111,6 +115,13 @@ class _Writer:
     def set_yaw(self, yaw):
         """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
         self.turn += yaw - self.yaw
+
+    def _orientation(self, row, frame_id):
+        """A row as it is published, and its message."""
+        has_force = bool(row["acc"].any())   # zero: a gyroscope without an accelerometer
+        if self.turn or self._output.remove_gravity_vector:
+            row = self._changed(row, has_force)
+        return row, orientation_message(row, frame_id, has_force)
 
     def _changed(self, row, has_force):
         row = row.copy()
@@ -147,6 +158,7 @@ def warm_up(params):
         stamp = i * 10_000_000
         estimator.add_mag(stamp, np.array([0.0, 2e-5, -4e-5]))
         estimator.add_imu(stamp, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+    estimator.finish()    # with a lag: the smoother
 
 
 class OrientationStream(Stream):
@@ -251,6 +263,10 @@ class OrientationStream(Stream):
         if len(rows):
             for message in self._writer.messages(rows, self.frame_ids[IMU_TOPIC]):
                 self.emit(*message)
+        rows = self.estimator.take_corrected()
+        if len(rows):
+            for message in self._writer.corrected(rows, self.frame_ids[IMU_TOPIC]):
+                self.emit(*message)
 
 
 def findings(logs):
@@ -296,10 +312,12 @@ def run(logs, report, params, output):
             # What is published from the first fix on refers to true north.
             before = [part[part.stamp < stamp] for part in (imu_part, mag_part)]
             yield from writer.messages(estimator.run(*before), imu.frame_id)
+            yield from writer.corrected(estimator.take_corrected(), imu.frame_id)
             writer.turn = turn
             imu_part, mag_part = (part[part.stamp >= stamp] for part in (imu_part, mag_part))
         rows = [estimator.run(imu_part, mag_part), estimator.finish()]
         yield from writer.messages(np.concatenate(rows), imu.frame_id)
+        yield from writer.corrected(estimator.take_corrected(), imu.frame_id)
     report.results = estimator.summary()
 
 

@@ -26,7 +26,7 @@ from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from test.nodes.conftest import START, STEP, collector
 
 OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool,
-           "/imu/flags": DiagnosticArray, "/imu/gyro_bias": TwistWithCovarianceStamped}
+           "/imu/data_smoothed": Imu, "/imu/flags": DiagnosticArray, "/imu/gyro_bias": TwistWithCovarianceStamped}
 NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
 
 
@@ -73,11 +73,14 @@ def fields(topic, cdr):
     return stamp, frame_id, values.tobytes()
 
 
-def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_path):
+@pytest.mark.parametrize("lag", [0.0, 0.4])
+def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_path, lag):
     bag = write(tmp_path / "bag", *recording)
-    batch.process(bag, tmp_path / "out")
+    params = tmp_path / "params.yaml"
+    params.write_text(f"orientation_estimator:\n  ros__parameters:\n    lag: {lag}\n")
+    batch.process(bag, tmp_path / "out", params)
     sink = collector(graph, topics=OUTPUTS)
-    graph.start(OrientationEstimatorNode, qos="reliable")
+    graph.start(OrientationEstimatorNode, qos="reliable", lag=lag)
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
     graph.until(lambda: replayer.finished and sink.ended)
     with open_bag(tmp_path / "out") as reader:
@@ -88,6 +91,8 @@ def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_
             assert sorted(live) == sorted(offline), topic
             if topic == "/imu/data":
                 assert len(offline) == len(recording[0]) - 2
+            if topic == "/imu/data_smoothed":
+                assert len(offline) == (len(recording[0]) - 2 if lag else 0)
 
 
 def test_a_gyroscope_alone_gives_orientation_and_says_what_is_absent(graph, recording, tmp_path):
