@@ -141,7 +141,7 @@ class OrientationParams(Parameters):
     rest_time: float = param(0.5, unit="s", low=0, doc="Time after which rest counts.")
     rest_rate_sd: float = param(0.006, unit="rad/s", low=1e-6,
                                 doc="Rate of a hand or table at rest.")
-    saturation_walk: float = param(20.0, unit="rad/s/sqrt(s)", low=0,
+    saturation_walk: float = param(25.0, unit="rad/s/sqrt(s)", low=0,
                                    doc="Random walk of a rate beyond the gyroscope's limit.")
     max_mag_lag: float = param(0.1, unit="s", low=0, high=10,
                                doc="Magnetometer samples that arrive later are dropped.")

@@ -29,8 +29,8 @@ from imu_fusion.estimation.orientation_fusion_detect import (
 from imu_fusion.estimation.orientation_fusion_field import (
     collect_mags, start_field, update_mag)
 from imu_fusion.estimation.orientation_fusion_layout import (
-    ACC_LAST, BLOCK_MAGS, BLOCK_START, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT, MAG_ROWS, MAG_SUM,
-    MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK, P_ESTIMATE_BIAS, P_EXCESS_WALK,
+    ACC_LAST, BLOCK_MAGS, BLOCK_START, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT,
+    MAG_ROWS, MAG_SUM, MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK, P_ESTIMATE_BIAS, P_EXCESS_WALK,
     P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD,
     P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD, P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME,
     REST_SINCE, S, SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
@@ -47,7 +47,7 @@ _MOTION_TIME = 10.0        # s: over which the size of the motion is judged
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
-_BURST_SHARE = 0.5         # of the block, while an axis is at its limit
+_BURST_SHARE = 0.1         # of the block, while an axis is at its limit
 
 
 def pack(par, p):
@@ -212,7 +212,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
 
     clipped = find_limits(x, k, par, gyr)
     if clipped:
-        flags |= st.FLAG_SATURATED
+        flags |= st.FLAG_SATURATED | clipped << st.FLAG_SATURATED_AXES
         k[st.SATURATED] += 1
     k[CLIPPED] |= clipped
 
@@ -284,12 +284,14 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
         flags |= st.FLAG_NO_HEADING
     if stamp <= k[st.ALIGN_UNTIL]:
         flags |= st.FLAG_ALIGNING
-    _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, taken, row, row_int)
+    _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, taken, row, row_int,
+           len(tape) > 0)
     return result
 
 
 @njit(cache=True)
-def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, taken, row, row_int):
+def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, taken, row, row_int,
+           taped):
     """The output row of the present state."""
     cov = x[COV:COV + N * N].reshape(N, N)
     noise_dt = dt if dt > 0.0 else 1e-2
@@ -311,9 +313,8 @@ def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, tak
         force[i] = acc[i] - x[S + es.ACC_BIAS + i]
     cov_world[2, 2] += x[HEADING_VAR]
     rate = _rate(x, gyr)
-    for i in range(3):
-        if (clipped >> i) & 1:
-            rate[i] = math.copysign(max(abs(rate[i]), x[LIMIT + i]), gyr[i])
+    if not taped:    # else the smoother does it, after its correction
+        st.beyond_limits(rate, clipped, x[LIMIT:LIMIT + 3])
     st.write_row(row, row_int, par, stamp, x[st.Q:st.Q + 4], cov_world, rate, var_gyr,
                  force, par[st.P_ACC_DENSITY] ** 2 / noise_dt + cov[es.ACC_BIAS, es.ACC_BIAS],
                  x[S + es.BIAS:S + es.BIAS + 3], bias_var, mag, reliability, flags, taken)

@@ -54,7 +54,8 @@ def smooth(x, k, par, stamps, samples, mag_stamps, mags, rows, rows_int):
         _, _, _, blocks = _forward(x0, k0, par, stamps, samples, mag_stamps, mags, i, j, first,
                                    rows, rows_int, tapes, block_stamps, block_of_row)
         _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, end,
-                  adjoint, information, par, x[fusion.HEADING_VAR], rows, rows_int)
+                  adjoint, information, par, x[fusion.HEADING_VAR],
+                  x[fusion.LIMIT:fusion.LIMIT + 3], rows, rows_int)
         end = first
     return written
 
@@ -82,11 +83,13 @@ def _forward(x, k, par, stamps, samples, mag_stamps, mags, i, j, written, rows, 
 
 @njit(cache=True)
 def _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, end, adjoint,
-              information, par, heading_var, rows, rows_int):
+              information, par, heading_var, limits, rows, rows_int):
     """Correct the rows first..end of one segment; carry adjoint and information before it."""
     row = end - 1
     while row >= first and block_of_row[row] == blocks:
-        row -= 1         # behind the last block of the recording: already the best there is
+        # Behind the last block of the recording: already the best there is.
+        st.beyond_limits(rows[row, st.ROW_GYR:st.ROW_GYR + 3], _clipped(rows_int[row]), limits)
+        row -= 1
     for b in range(blocks - 1, -1, -1):
         tape = tapes[b]
         move = tape[es.TAPE_MOVE:es.TAPE_MOVE + es.MOVE_SIZE]
@@ -122,8 +125,8 @@ def _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, en
                 part = (rows_int[row, 0] - before_stamp) / span
                 error = (1.0 - part) * before + part * predicted
                 cov_row = (1.0 - part) * cov_before + part * cov_after
-            _correct_row(rows[row], par, error, cov_row, heading_var,
-                         rows_int[row, st.FLAGS_WORD] & st.FLAG_SATURATED)
+            _correct_row(rows[row], par, error, cov_row, heading_var, _clipped(rows_int[row]),
+                         limits)
             row -= 1
 
 
@@ -144,7 +147,13 @@ def _smoothed_cov(cov, information):
 
 
 @njit(cache=True)
-def _correct_row(row, par, error, cov, heading_var, saturated):
+def _clipped(row_int):
+    """Bits of the gyroscope axes at their limit."""
+    return (row_int[st.FLAGS_WORD] >> st.FLAG_SATURATED_AXES) & 7
+
+
+@njit(cache=True)
+def _correct_row(row, par, error, cov, heading_var, clipped, limits):
     """Apply the error (N,) and its covariance (12, 12) to one output row."""
     frame = par[st.P_FRAME:st.P_FRAME + 4]
     turn = quat_exp(error[es.ATT:es.ATT + 3])
@@ -156,13 +165,15 @@ def _correct_row(row, par, error, cov, heading_var, saturated):
     rate = row[st.ROW_GYR:st.ROW_GYR + 3].copy()
     for i in range(3):
         row[st.ROW_BIAS + i] += error[es.BIAS + i]
-        row[st.ROW_GYR + i] += error[es.EXCESS + i] * (saturated != 0) - error[es.BIAS + i]
+        at_limit = (clipped >> i) & 1
+        row[st.ROW_GYR + i] += error[es.EXCESS + i] * at_limit - error[es.BIAS + i]
         for j in range(3):
             row[st.ROW_GYR + i] += error[es.SCALE + 3 * i + j] * rate[j]
         row[st.ROW_ACC + i] -= error[es.ACC_BIAS + i]
         row[st.ROW_BIAS_SD + i] = math.sqrt(max(cov[3 + i, 3 + i], 0.0))
-        if saturated:
+        if at_limit:
             row[st.ROW_COV_GYR + 4 * i] = max(cov[9 + i, 9 + i], 0.0) + cov[3 + i, 3 + i]
+    st.beyond_limits(row[st.ROW_GYR:st.ROW_GYR + 3], clipped, limits)
     r = quat_to_matrix(quat)
     for i in range(3):
         for j in range(3):

@@ -44,6 +44,7 @@ FLAG_GAP = 16           # samples are missing before this one
 FLAG_ALIGNING = 32      # inside the interval from which the initial orientation was found
 FLAG_NO_HEADING = 64    # no magnetometer sample has fixed the heading yet
 FLAG_MAG_SATURATED = 128  # a magnetometer sample was refused: an axis is at its limit
+FLAG_SATURATED_AXES = 8   # by how many bits those of x, y, z are shifted: 256, 512, 1024
 
 UNIFORM_VARIANCE = math.pi ** 2 / 3.0   # rad^2, of an angle about which nothing is known
 
@@ -259,6 +260,15 @@ def is_newer(k, stamp, sample):
         return False
     k[IMU_USED] += 1
     return True
+
+
+@njit(cache=True)
+def beyond_limits(rate, clipped, limits):
+    """Raise a rate (3,), in place, to the limits of the axes (bits) that are at theirs: what the
+    gyroscope does not show lies beyond."""
+    for i in range(3):
+        if (clipped >> i) & 1 and abs(rate[i]) < limits[i] < math.inf:
+            rate[i] = math.copysign(limits[i], rate[i])
 
 
 @njit(cache=True)
