@@ -19,6 +19,15 @@ from imu_fusion.parameters import Parameters, param
 from imu_fusion.surfaces.hill import Hill
 
 
+_FADE = 0.8     # s, over which the wobble begins and ends
+
+
+def _product(f, g):
+    """Value, first and second derivative (3, n) of a product."""
+    return np.stack([f[0] * g[0], f[1] * g[0] + f[0] * g[1],
+                     f[2] * g[0] + 2.0 * f[1] * g[1] + f[0] * g[2]])
+
+
 @dataclass(frozen=True)
 class JumpParams(Parameters):
     """How somebody jumps."""
@@ -34,6 +43,8 @@ class JumpParams(Parameters):
     sink_time: float = param(0.05, doc="Time constant of the knees on landing", unit="s",
                              low=0.01)
     braking: float = param(6.0, doc="Deceleration in the out-run", unit="m/s^2", low=1)
+    wobble: float = param(0.0, doc="Amplitude of the sensor's height above the profile while the "
+                                   "skis are on it: knees, arms, snow", unit="m", low=0, high=0.2)
     drift: float = param(0.6, doc="Amplitude of the sideways motion after take-off", unit="m",
                          low=0)
     duration: float = param(27.0, doc="Length of the recording", unit="s", low=10)
@@ -125,17 +136,32 @@ class SkiJump:
         """Height above the table while pushing off, and its derivatives."""
         p = self.params
         s = np.clip((t - self.t_takeoff) / p.push_duration + 1.0, 0.0, 1.0)
-        return (p.push_speed * p.push_duration * (s ** 3 - 0.5 * s ** 4),
-                p.push_speed * (3.0 * s ** 2 - 2.0 * s ** 3),
-                p.push_speed / p.push_duration * 6.0 * (s - s * s))
+        return np.stack([p.push_speed * p.push_duration * (s ** 3 - 0.5 * s ** 4),
+                         p.push_speed * (3.0 * s ** 2 - 2.0 * s ** 3),
+                         p.push_speed / p.push_duration * 6.0 * (s - s * s)])
 
     def _sink(self, t):
         """Height above the landing profile after touch-down (negative), and its derivatives."""
         tau = self.params.sink_time
         s = (t - self.t_touchdown) / tau
         decay = -self._sink_speed * np.exp(-s)
-        return (decay * tau * (s + s * s), decay * (1.0 + s - s * s),
-                decay / tau * (s * s - 3.0 * s))
+        return np.stack([decay * tau * (s + s * s), decay * (1.0 + s - s * s),
+                         decay / tau * (s * s - 3.0 * s)])
+
+    def _wobble(self, t, begin, end):
+        """Height above the profile that comes and goes between two times, and its derivatives:
+        slower and faster than the bends of the profile."""
+        def faded(since):
+            s = np.clip(since / _FADE, 0.0, 1.0)
+            return np.stack([s ** 3 * (10.0 - 15.0 * s + 6.0 * s * s),
+                             30.0 * (s * (1.0 - s)) ** 2 / _FADE,
+                             60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / _FADE ** 2])
+
+        sines = sum(share * np.stack([np.sin(w * t + phase), w * np.cos(w * t + phase),
+                                      -w * w * np.sin(w * t + phase)])
+                    for share, w, phase in ((0.7, 2.1, 0.4), (0.3, 7.3, 1.9)))
+        before = faded(end - t) * np.array([[1.0], [-1.0], [1.0]])
+        return self.params.wobble * _product(_product(faded(t - begin), before), sines)
 
     def _on_profile(self, t, state, derivative, profile, height):
         """x, z and derivatives on a profile, at a height above it."""
@@ -161,7 +187,7 @@ class SkiJump:
         if m.any():
             pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
                 t[m], self._run(t[m]), self._ground(hill.in_run, p.drag_in_run, None),
-                hill.in_run, self._push(t[m]))
+                hill.in_run, self._push(t[m]) + self._wobble(t[m], self.t_start, self.t_takeoff))
         m = masks[2]
         if m.any():
             y = self._air(t[m])
@@ -171,7 +197,7 @@ class SkiJump:
         if m.any():
             pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
                 t[m], self._out(t[m]), self._ground(hill.landing, p.drag, self._brake_x),
-                hill.landing, self._sink(t[m]))
+                hill.landing, self._sink(t[m]) + self._wobble(t[m], self.t_touchdown, np.inf))
         return pos, vel, acc
 
     def _angles(self, t):

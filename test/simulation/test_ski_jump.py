@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.simulation.jump_sensors import EPOCH, PhoneErrors, record
 from imu_fusion.simulation.noise_gnss import GnssErrors, gauss_markov, gnss_errors
-from imu_fusion.simulation.ski_jump import SkiJump
+from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
 from imu_fusion.surface_file import load_surface
 
 
@@ -56,6 +56,22 @@ def test_motion_stays_on_the_hill(jump, fine):
     touch = jump.hill.to_hill(jump.at([jump.t_touchdown]).position_world)[0]
     assert abs(touch[0] - jump.x_touchdown) < 1e-9
     assert 80 < jump.length < 110  # a plausible jump on this hill
+
+
+def test_a_wobble_stays_within_its_amplitude_and_is_motion(jump, fine):
+    shaken = SkiJump(jump.hill, JumpParams(wobble=0.03))
+    motion = shaken.at(fine.time)
+    height = (motion.position_world - fine.position_world)[:, 2]
+    ground = (fine.time < jump.t_takeoff) | (fine.time > jump.t_touchdown)
+    assert 0.02 < np.abs(height[ground]).max() <= 0.03
+    assert (height[~ground] == 0.0).all()
+    # The difference from the motion without it is smooth: Simpson's rule at 1 ms is exact to
+    # rounding. A wrong derivative would leave centimetres.
+    for derivative, value in (("vel_world", "position_world"), ("acc_world", "vel_world")):
+        rate, change = (getattr(motion, name)[:, 2] - getattr(fine, name)[:, 2]
+                        for name in (derivative, value))
+        summed = cumulative_simpson(rate, x=fine.time, initial=0)
+        assert np.abs(summed - (change - change[0])).max() < 1e-6
 
 
 def test_energy_of_the_in_run(jump):
