@@ -64,7 +64,7 @@ class StageReport:
     """What one stage did: samples taken and refused per topic, messages written.
 
     ``skipped`` says why it did not run; ``summary`` is a line of text, ``results`` plain
-    numbers of what it found.
+    numbers of what it found, ``remarks`` texts on what makes them doubtful.
     """
 
     node: str
@@ -75,6 +75,7 @@ class StageReport:
     skipped: str = ""
     summary: str = ""
     results: dict = field(default_factory=dict)
+    remarks: list = field(default_factory=list)
 
 
 def _types(inputs, topics):
@@ -192,6 +193,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
                 progress(f"{stage.node}: {report.summary}")
         found = {report.node: report.results for report in reports if report.results}
         (writer.directory / "results.json").write_text(json.dumps(found, indent=2))
+    warnings += [f"{report.node}: {text}" for report in reports for text in report.remarks]
     return reports, list(dict.fromkeys(warnings))
 
 

@@ -174,7 +174,8 @@ def smooth(params, logs):
 def results(result):
     """Plain numbers of a SmootherResult, for JSON."""
     numbers = {"samples": len(result.samples), "iterations": result.iterations,
-               "converged": bool(result.converged), "cost": float(result.cost[-1])}
+               "converged": bool(result.converged), "cost": float(result.cost[-1]),
+               "misfit": result.misfit()}
     if result.jump is not None:
         numbers["jump"] = result.jump.to_mapping()
     return numbers
@@ -251,4 +252,5 @@ def run(logs, report, params):
         return
     report.summary = result.summary()
     report.results = results(result)
+    report.remarks = result.remarks()
     yield from messages(result, logs[IMU_TOPIC][0].frame_id, params.path_rate)

@@ -25,7 +25,7 @@ def _smooth_in_child(connection, params, logs):
     try:
         result = smoothing.smooth(params, logs)
         frame_id = logs[smoothing.IMU_TOPIC][0].frame_id
-        connection.send((result.summary(),
+        connection.send(("; ".join([result.summary(), *result.remarks()]),
                          list(smoothing.messages(result, frame_id, params.path_rate))))
     except ImuFusionError as error:
         connection.send((None, str(error)))

@@ -157,6 +157,8 @@ def write_recording_report(bag, estimates, path, params_file=None):
         estimates = "this report's own run"
     smoothed, reason = smooth_recording(contents, params_file)
     warnings = [*contents.warnings, *warnings]
+    if smoothed is not None:
+        warnings += smoothed.result.remarks()
     raw, mag = contents.log(RAW), contents.log(MAGNETOMETER)
     reference = contents.log(contents.reference_name)
     is_truth = contents.reference_name == REFERENCE

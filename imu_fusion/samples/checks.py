@@ -119,7 +119,8 @@ def check_stamps(stamp, name):
 
 def check_finite(values, name, quantity):
     """A finding about rows (n, ...) that are not numbers."""
-    values = np.asarray(values).reshape(len(values), -1)
+    values = np.asarray(values)
+    values = values.reshape(len(values), int(np.prod(values.shape[1:])))
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad) == 0:
         return []

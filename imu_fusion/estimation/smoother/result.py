@@ -12,6 +12,15 @@ SAMPLE = np.dtype([
     ("acc_bias", "f8", 3), ("cov_position", "f8", (3, 3)), ("cov_velocity", "f8", (3, 3)),
     ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3)])
 
+_GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
+_MISFIT = 3.0
+_CAUSES = {
+    "fix": "the covariances of the messages may be too small (else fix_sd), the stamps late "
+           "(gnss_time_offset_sd: 0.2 finds it) or the errors wander (gnss_position_error_sd)",
+    "velocity": "the covariances of the messages may be too small (else velocity_sd), the stamps "
+                "late (velocity_time_offset_sd: 0.2 finds it) or filtered (gnss_velocity_error_sd)",
+    "mag": "the field may be disturbed, or mag_sd, mag_bias_sd and mag_scale_sd too small"}
+
 
 @dataclass(frozen=True)
 class SmootherResult:
@@ -41,3 +50,21 @@ class SmootherResult:
         state = "converged" if self.converged else "did not converge"
         return (f"{len(self.samples)} samples, {self.iterations} iterations ({state}), "
                 f"cost {self.cost[-1]:.6g}{jump}")
+
+    def misfit(self):
+        """Name -> typical size of its innovations, in standard deviations: 1 where the model is
+        right. By the median, so that outliers do not count."""
+        return {name: float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
+                for name, (_, values) in self.innovations.items() if len(values)}
+
+    def remarks(self):
+        """What a user should know before trusting the result: texts."""
+        texts = []
+        if not self.converged:
+            texts.append(f"the smoother did not converge in {self.iterations} iterations: take its "
+                         "result as provisional")
+        for name, size in self.misfit().items():
+            if size > _MISFIT:
+                texts.append(f"the {name} innovations are {size:.1f} times as large as their "
+                             f"standard deviations: {_CAUSES.get(name, _CAUSES['fix'])}")
+        return texts
