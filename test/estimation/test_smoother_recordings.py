@@ -30,6 +30,21 @@ def test_drive_through_withheld_stretches(drive):
     assert abs(delay - 0.125) < 0.01 and sd < 0.01
 
 
+@pytest.mark.parametrize("start", [120.0, 300.0, 400.0])
+@pytest.mark.parametrize("delays", [False, True])
+def test_a_start_at_speed_finds_its_heading(drive, start, delays):
+    """No magnetometer, no rest: only changes of velocity tell the heading, and defaults that
+    are not this car's. A wrong start used to end tens of sigma away, not converged."""
+    imu, fix, velocity, _ = drive
+    begin = int(imu.stamp[0] + start * 1e9)
+    logs = [log.between(begin, begin + 60_000_000_000) for log in (imu, fix, velocity)]
+    changes = dict(gnss_time_offset_sd=0.2, velocity_time_offset_sd=0.2) if delays else {}
+    result = Smoother(SmootherParams(**changes)).run(logs[0], None, *logs[1:])
+    assert result.converged and result.misfit()["fix"] < 1.5 and not result.remarks()
+    if delays:
+        assert result.states["velocity_time_offset"][0][0, 0] == pytest.approx(0.125, abs=0.01)
+
+
 def test_drive_with_degraded_fixes(drive):
     imu, fix, velocity, _ = drive
     result, axes, nees = smoother_drive.degraded(imu, fix, velocity, 0)

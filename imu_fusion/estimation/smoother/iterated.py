@@ -10,6 +10,7 @@ forward and the Bryson-Frazier pass back (:mod:`.kernel`); between samples the t
 may gape (multiple shooting), and the step closes the gaps.
 """
 
+import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,10 @@ from imu_fusion.estimation.smoother import kernel, model
 from imu_fusion.estimation.smoother.inputs import evaluate_constraints
 from imu_fusion.estimation.smoother.transition import boxminus
 
+_BEGINNING = 20_000_000_000   # ns, from which first attitudes are judged at least
+_HELD_SD = 1e-6               # s, of a delay that is not estimated yet
+_SETTLED = 0.01               # relative change of the cost with which delays are let go
+_DELAY_SDS = 3.0              # standard deviations within which a delay of stamps is believed
 
 
 @dataclass
@@ -76,11 +81,12 @@ class Problem:
         squares = (self.innovation[:start[count]] ** 2).sum(axis=1)
         return cost, float(np.log1p(squares / 25.0).sum())
 
-    def search_heading(self, candidates):
-        """Filter the beginning from each attitude (k, 4); keep the most plausible one.
+    def rank(self, candidates):
+        """Filter the beginning from each attitude (k, 4); return them, the most plausible first.
 
         The beginning ends where the fixes have moved far beyond their noise, which is what
-        tells headings apart.
+        tells headings apart, but not before ``_BEGINNING``: a start at speed moves at once, and
+        only changes of velocity tell headings apart then.
         """
         start, kind, _, value, whiten = self.attached[:5]
         sample = np.repeat(np.arange(len(self.x)), np.diff(start))
@@ -88,11 +94,23 @@ class Problem:
         apart = np.linalg.norm(value[fixes] - value[fixes][0], axis=1)
         moved = np.flatnonzero(apart * whiten[fixes, 0, 0] > 20.0)
         count = len(self.x) if not len(moved) else int(sample[fixes][moved[0]]) + 1
+        stamp = self.imu.log.stamp
+        least = int(np.searchsorted(stamp, stamp[0] + _BEGINNING))
+        count = min(max(count, least), len(self.x))
         scores = []
         for quat in candidates:
             self.prior[6:10] = quat
             scores.append(self.follow(count)[1])
-        self.prior[6:10] = candidates[int(np.argmin(scores))]
+        return candidates[np.argsort(scores, kind="stable")]
+
+    def from_attitude(self, quat):
+        """The same problem, not yet solved, with a first attitude (4,)."""
+        other = copy.copy(self)
+        other.prior, other.x, other.cost = self.prior.copy(), np.empty_like(self.x), []
+        other.prior[6:10] = quat
+        other.x[0] = other.prior
+        other.attach()
+        return other
 
     def step(self, events, margin, with_cov=False):
         """One Gauss-Newton step; moves x.
@@ -115,6 +133,12 @@ class Problem:
             covariances, variances)
         self.cost.append(0.5 * (prior_cost + cost + self.process))
         self.process = process
+        # A delay that runs away beyond belief takes the measurements with it.
+        for block in (model.TIME_OFFSET, model.VELOCITY_OFFSET):
+            i = self.layout[block]
+            if i >= 0:
+                bound = _DELAY_SDS * self.prior_sd[i]
+                np.clip(self.x[:, i + 1], -bound, bound, out=self.x[:, i + 1])
         if with_cov:
             sampled = np.append(np.arange(0, total - 1, kernel.THINNING), total - 1)
             for column in variances.T:
@@ -137,9 +161,14 @@ def solve(problem, events, refine):
     """
     params = problem.params
     margin = params.event_margin
+    # Delays as loose as their prior would explain at first what the attitude still has wrong.
+    delays = [i for i in problem.layout[[model.TIME_OFFSET, model.VELOCITY_OFFSET]] if i >= 0]
+    moving = held = bool(delays)
+    prior_sd = problem.prior_sd
+    problem.prior_sd = prior_sd.copy()
+    problem.prior_sd[delays] = _HELD_SD
     problem.follow()
-    moving = (problem.layout[[model.TIME_OFFSET, model.VELOCITY_OFFSET]] >= 0).any()
-    refined, converged, steps = events is None, False, 0
+    refined, converged, steps, changed = events is None, False, 0, 0
     while steps < params.max_iterations:
         largest, _, _ = problem.step(events, margin)
         steps += 1
@@ -147,11 +176,17 @@ def solve(problem, events, refine):
             break
         if moving:
             problem.attach()
+        # A cost is that before its step: the first two after a change cannot be compared.
+        change = np.inf
+        if len(problem.cost) > changed + 1:
+            change = abs(problem.cost[-1] - problem.cost[-2])
+        if held and change <= _SETTLED * problem.cost[-1]:
+            problem.prior_sd, held, changed = prior_sd, False, len(problem.cost)
+            continue
         # Where readings change their sample as a delay is found, the step may end in a tiny
         # cycle that no cost tells apart.
-        still = len(problem.cost) > 1 and (
-            abs(problem.cost[-1] - problem.cost[-2]) <= params.cost_tolerance)
-        if largest.max() > params.tolerance and not still:
+        still = change <= params.cost_tolerance
+        if held or (largest.max() > params.tolerance and not still):
             continue
         if refined:
             converged = True
@@ -161,5 +196,6 @@ def solve(problem, events, refine):
             converged = True
             break
         events = better
+    problem.prior_sd = prior_sd
     _, covariances, variances = problem.step(events, margin, with_cov=True)
     return events, steps, converged, covariances, variances

@@ -16,6 +16,9 @@ from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_worl
 from imu_fusion.surfaces.hill import Hill
 
 _KINDS = {model.FIX: "fix", model.VELOCITY: "velocity", model.MAG: "mag"}
+# A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
+_STARTS = 4          # first attitudes tried until one fits
+_PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
 class Smoother:
@@ -55,19 +58,26 @@ class Smoother:
             events = detect_jump(prepared.log, velocity)
         measurements = prepare_measurements(frame, mag, fix, velocity, params)
         problem = self._problem(prepared, frame, measurements, constraints, fix)
-        self._initialise(problem, mag, initial_quat)
-
         hill = surface if isinstance(surface, Hill) and events is not None else None
 
         def refine(problem, events):
             return refine_jump(hill, _positions(problem), prepared.log, events)
 
-        events, steps, converged, cov, var = iterated.solve(
-            problem, events if hill is not None else None, refine)
-        if not np.isfinite(problem.x).all():
+        best = None
+        for quat in self._first_attitudes(problem, mag, initial_quat)[:_STARTS]:
+            attempt = problem.from_attitude(quat)
+            outcome = iterated.solve(attempt, events if hill is not None else None, refine)
+            if not np.isfinite(attempt.x).all():
+                continue
+            result = self._result(attempt, frame, hill, *outcome)
+            if best is None or result.cost[-1] < best.cost[-1]:
+                best = result
+            if result.converged and result.misfit()["fix"] < _PLAUSIBLE:
+                break
+        if best is None:
             raise EstimationError("the smoother diverged: noise far below that of the data, or "
                                   "measurements of another recording")
-        return self._result(problem, frame, hill, events, steps, converged, cov, var)
+        return best
 
     def _problem(self, prepared, frame, measurements, constraints, fix):
         p = self.params
@@ -110,7 +120,8 @@ class Smoother:
             earth_rate=earth_rate_world(frame.latitude_deg), field_world=np.array(field) * 1e6, constraints=constraints, layout=layout,
             prior_sd=sd, decay_rate=decay, walk=walk)
 
-    def _initialise(self, problem, mag, initial_quat):
+    def _first_attitudes(self, problem, mag, initial_quat):
+        """Set the problem's prior; attitudes (k, 4) to start from, the most plausible first."""
         p, size = self.params, problem.size
         kind, value = problem.attached[1], problem.attached[3]
         prior = np.zeros(size + 1)
@@ -141,7 +152,7 @@ class Smoother:
                 reading = early.mag[finite].mean(axis=0) if finite.any() else None
             initial_quat = initial.attitude_from_vectors(acc, reading, problem.field_world)
             candidates = 12 if reading is None else 4
-        problem.search_heading(initial.headings(initial_quat, candidates))
+        return problem.rank(initial.headings(initial_quat, candidates))
 
     def _result(self, problem, frame, hill, events, steps, converged, cov, var):
         recorded = problem.imu.recorded
