@@ -236,6 +236,20 @@ def test_what_cannot_be_estimated_says_so(jump, recording):
                                         fix.height, cov, fix.status), velocity)
 
 
+def test_a_result_to_be_doubted_says_why(jump, recording, result):
+    assert result.remarks() == []
+    few = Smoother(SmootherParams(max_iterations=1), jump.hill).run(
+        recording.imu, recording.mag, recording.fix, recording.velocity)
+    assert any("did not converge" in text for text in few.remarks())
+    # Fixes of 3 m and 5 m that claim to be ten times better, without the loss that hides it.
+    fix = dataclasses.replace(recording.fix, cov_enu=np.broadcast_to(
+        np.diag([0.09, 0.09, 0.25]), (len(recording.fix), 3, 3)))
+    claimed = Smoother(SmootherParams(fix_loss_scale=0.0)).run(
+        recording.imu, recording.mag, fix, recording.velocity)
+    assert claimed.misfit()["fix"] > 5.0
+    assert any("fix innovations" in text and "fix_sd" in text for text in claimed.remarks())
+
+
 def test_given_events_are_used_without_velocities(jump, recording):
     events = JumpEvents(EPOCH + int(jump.t_takeoff * 1e9), EPOCH + int(jump.t_touchdown * 1e9))
     r = Smoother(SmootherParams(), jump.hill).run(recording.imu, recording.mag, recording.fix,

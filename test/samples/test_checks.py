@@ -164,6 +164,15 @@ def test_values_that_are_not_finite_are_counted():
     assert "2 of 2000" in finding.text and "sample 5" in finding.text and kinds(findings) == ["nan"]
 
 
+def test_no_fix_at_all_is_told():
+    n = 3
+    log = FixLog(stamp=np.arange(n) * 10 ** 9, latitude_deg=np.full(n, 47.0),
+                 longitude_deg=np.full(n, 8.0), height=np.zeros(n),
+                 cov_enu=np.zeros((n, 3, 3)), status=np.full(n, -1))
+    (finding,) = checks.check_fix(log)
+    assert finding.kind == "fix" and "3 of 3" in finding.text
+
+
 def test_fixes_without_a_fix_are_told():
     n = 6
     log = FixLog(stamp=np.arange(n) * 10 ** 9, latitude_deg=[47, 47, 0, 95, 47, np.nan],
