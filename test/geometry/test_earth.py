@@ -1,7 +1,11 @@
 """Geodesy, gravity and magnetic field against official values and independent formulas."""
 
+from importlib.resources import files
+from math import factorial
+
 import numpy as np
 import pytest
+from scipy.special import lpmv
 
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.geometry.geodesy import LocalFrame, hill_axes
@@ -84,6 +88,46 @@ def test_world_magnetic_model_official_values(year, km, lat, lon, x, y, z):
     # The official table is printed to 0.1 nT: half a digit and rounding.
     assert np.abs(field * 1e9 - [y, x, -z]).max() <= 0.051
     assert np.isclose(declination(lat, lon, km * 1e3, year), np.arctan2(y, x), atol=2e-5)
+
+
+def _potential(ecef_km, year, coefficients):
+    """Scalar potential (nT km) of the coefficients (n, m, g, h, dg, dh) at epoch 2025, from its
+    definition with scipy's Legendre functions: shares no formula with pygeomag."""
+    r = np.linalg.norm(ecef_km)
+    sine, longitude = ecef_km[2] / r, np.arctan2(ecef_km[1], ecef_km[0])
+    total = 0.0
+    for n, m, g, h, dg, dh in coefficients:
+        n, m, since = int(n), int(m), year - 2025.0
+        # Schmidt's semi-normalisation; scipy has the Condon-Shortley phase, geomagnetism not.
+        scale = (-1.0) ** m * np.sqrt((2.0 if m else 1.0) * factorial(n - m) / factorial(n + m))
+        total += (6371.2 * (6371.2 / r) ** (n + 1) * scale * lpmv(m, n, sine)
+                  * ((g + since * dg) * np.cos(m * longitude)
+                     + (h + since * dh) * np.sin(m * longitude)))
+    return total
+
+
+@pytest.mark.parametrize("year, km, lat, lon", [
+    (2025.0, 0.0, 80.0, 0.0), (2027.5, 0.9, 47.4, 10.3), (2029.9, 100.0, -80.0, 240.0),
+    (2026.3, 2.0, -33.9, 151.2), (2028.0, 0.0, 0.0, 120.0)])
+def test_world_magnetic_model_is_the_gradient_of_its_potential(year, km, lat, lon):
+    """To 0.01 nT, finer than the official table is printed."""
+    file = files("pygeomag") / "wmm" / "WMM_2025.COF"
+    lines = [line.split() for line in file.read_text().splitlines()]
+    coefficients = np.array([line for line in lines if len(line) == 6], dtype=float)
+    assert len(coefficients) == 90
+    place = _ecef(lat, lon, 1e3 * km) / 1e3
+    step = 1.0   # km: the error of fourth order is (12 / 6371)^4 of the field, 1e-6 nT
+    gradient = np.empty(3)
+    for i, axis in enumerate(np.eye(3)):
+        v = [_potential(place + k * step * axis, year, coefficients) for k in (-2, -1, 1, 2)]
+        gradient[i] = (v[0] - 8.0 * v[1] + 8.0 * v[2] - v[3]) / (12.0 * step)
+    phi, lam = np.radians([lat, lon])
+    east = [-np.sin(lam), np.cos(lam), 0.0]
+    north = [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)]
+    up = [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)]
+    expected = -np.array([east, north, up]) @ gradient
+    field = magnetic_field_world(lat, lon, 1e3 * km, year) * 1e9
+    assert np.abs(field - expected).max() < 0.01
 
 
 def test_decimal_year_and_unknown_dates():
