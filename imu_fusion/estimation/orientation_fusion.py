@@ -25,7 +25,7 @@ from numba import njit
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_detect import (
-    REST_MEMORY, find_limits, is_still, mean_rate, start_limits)
+    REST_MEMORY, find_limits, hold_spike, is_still, mean_rate, start_limits)
 from imu_fusion.estimation.orientation_fusion_field import (
     collect_mags, start_field, update_mag)
 from imu_fusion.estimation.orientation_fusion_layout import (
@@ -216,10 +216,13 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
         k[st.SATURATED] += 1
     k[CLIPPED] |= clipped
 
+    missed = np.zeros(3)
+    if not first and hold_spike(x, k, gyr, dt, missed):
+        flags |= st.FLAG_HELD
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()
     raw = 0.5 * (last + gyr)
-    phi = st.rotation_of_step(_rate(x, last), _rate(x, gyr), dt)
+    phi = st.rotation_of_step(_rate(x, last), _rate(x, gyr), dt) + missed
     middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(0.5 * phi)))
     x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], quat_exp(phi)))
     k[st.LAST_STAMP] = stamp

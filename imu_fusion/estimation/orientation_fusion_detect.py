@@ -8,8 +8,8 @@ from numba import njit
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_layout import (
-    COV, ENTRY, LARGEST, LIMIT, MEAN_FORCE, MEAN_RATE, N, P_REST_FORCE, P_REST_RATE,
-    P_REST_TIME, REPEATED, REPEATS, REST_SINCE, S)
+    CHANGE, COV, ENTRY, HELD, HELD_RATE, HELD_STEP, LARGEST, LIMIT, MEAN_FORCE, MEAN_RATE, N,
+    P_REST_FORCE, P_REST_RATE, P_REST_TIME, REPEATED, REPEATS, REST_SINCE, S)
 from imu_fusion.sensors.saturation import LIMIT_TOLERANCE
 
 REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
@@ -17,6 +17,10 @@ _REST_TURN = 1.5e-3         # rad/s per axis: slower turning than 0.5 deg/s pass
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
 _ENTRY_SHARE = 2e-3        # a flat top is run into; a quantised smooth peak is not
 _LIMIT_FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
+_SPIKE = 10.0              # rad/s within a sample: more than a tap on the sensor (7 were seen)
+_SPIKE_CHANGES = 20.0      # times the usual change that makes a rate suspect
+_SPIKE_MEMORY = 1.0        # s, over which changes are usual
+_SPIKE_STEP = 0.05         # s: between slower samples anything can happen
 
 
 def start_limits(x, par):
@@ -54,6 +58,43 @@ def find_limits(x, k, par, gyr):
         if size >= x[LIMIT + i] * (1.0 - LIMIT_TOLERANCE):
             clipped |= 1 << i
     return clipped
+
+
+@njit(cache=True)
+def hold_spike(x, k, gyr, dt, missed):
+    """Keep a single wild rate from turning the attitude.
+
+    A rate far from the one before is held back, which then stands in for it. If the next
+    one is back where it came from, it was none; if not, it was motion, and what was missed of
+    the rotation is made up for.
+
+    Args:
+        gyr: (3,) rad/s, replaced while held. dt: s since the sample before.
+        missed: (3,) zeros; gets the rotation to make up for, rad.
+
+    Returns:
+        Whether the rate is held.
+    """
+    change = 0.0
+    for i in range(3):
+        change = max(change, abs(gyr[i] - x[st.GYR_LAST + i]))
+    is_far = change > max(_SPIKE, _SPIKE_CHANGES * x[CHANGE])
+    if k[HELD]:
+        k[HELD] = 0
+        if is_far:
+            for i in range(3):
+                missed[i] = 0.5 * x[HELD_STEP] * (x[HELD_RATE + i] - x[st.GYR_LAST + i])
+                x[st.GYR_LAST + i] = x[HELD_RATE + i]
+        return False
+    if is_far and dt <= _SPIKE_STEP:
+        k[HELD] = 1
+        x[HELD_STEP] = dt
+        for i in range(3):
+            x[HELD_RATE + i] = gyr[i]
+            gyr[i] = x[st.GYR_LAST + i]
+        return True
+    x[CHANGE] += min(dt / _SPIKE_MEMORY, 1.0) * (change - x[CHANGE])
+    return False
 
 
 @njit(cache=True)

@@ -22,7 +22,10 @@ ENTRY = REPEATED + 3       # (3,) step with which it was reached
 LARGEST = ENTRY + 3        # (3,) largest rate seen
 SWAY = LARGEST + 3         # (3,) world acceleration through a leaky integral, m/s
 MOTION = SWAY + 3          # mean square of SWAY per axis, (m/s)^2
-X_SIZE = MOTION + 1
+CHANGE = MOTION + 1        # usual change of the rate from sample to sample, rad/s
+HELD_RATE = CHANGE + 1     # (3,) a rate that waits for the next to resemble it
+HELD_STEP = HELD_RATE + 3  # s, the step that it ended
+X_SIZE = HELD_STEP + 1
 
 # Integer state.
 BLOCK_MAGS = st.K_COMMON
@@ -32,7 +35,8 @@ WAS_CLIPPED = BLOCK_MAGS + 3  # the same in the block before
 REPEATS = BLOCK_MAGS + 4   # (3,) how often each axis repeated its largest value
 WORLD_TURNED = REPEATS + 3  # the heading was fixed in this block
 BLOCK_START = WORLD_TURNED + 1  # stamp of the last block's end
-K_SIZE = BLOCK_START + 1
+HELD = BLOCK_START + 1     # 1: a rate waits
+K_SIZE = HELD + 1
 
 # Parameters.
 (P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,

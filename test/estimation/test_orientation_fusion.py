@@ -10,7 +10,7 @@ from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation_state import (
-    FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
+    FLAG_GAP, FLAG_HELD, FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import saturated_axes
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
@@ -242,6 +242,52 @@ def test_one_wild_rate_does_not_hide_the_limit_and_both_ends_of_a_range_count():
     # What comes before the fourth sample of the first flat top of each axis is not known.
     assert flagged[at_limit.any(axis=1)][100:].all()
     assert not flagged[~at_limit.any(axis=1)].any()
+
+
+def test_single_wild_rates_do_not_turn_the_attitude(ordinary):
+    imu, mag, truth, _ = ordinary
+    rng = np.random.default_rng(0)
+    wild = rng.random(len(imu.stamp)) < 0.005
+    wild[:300] = False
+    wild[1:] &= ~wild[:-1]
+    gyr = imu.gyr.copy()
+    gyr[wild] += rng.choice([-1, 1], (wild.sum(), 3)) * rng.uniform(15, 40, (wild.sum(), 3))
+    rows = OrientationEstimator().run(ImuLog(imu.stamp, gyr, imu.acc), mag)
+    assert (((rows["flags"] & FLAG_HELD) != 0) == wild).all() and wild.sum() > 20
+    # Each would turn it by 15 to 40 rad/s times 5 ms, 4 to 11 deg.
+    assert rmse_deg(rows, truth) < 1.1 * rmse_deg(OrientationEstimator().run(imu, mag), truth)
+
+
+def test_a_sudden_turn_is_motion_and_none_of_it_is_lost():
+    """At rest, then at once 20 rad/s for 0.1 s: held for one sample, then made up for."""
+    n = 1000
+    stamp = np.arange(n, dtype=np.int64) * 5_000_000
+    gyr = np.zeros((n, 3))
+    gyr[600:620, 2] = 20.0
+    force = np.tile([0.0, 0.0, 9.81], (n, 1))
+    rows = OrientationEstimator(OrientationParams(gyro_scale_sd=0.0)).run(ImuLog(stamp, gyr, force))
+    held = np.flatnonzero(rows["flags"] & FLAG_HELD)
+    assert 600 in held and len(held) <= 2
+    yaw = np.unwrap(Rotation.from_quat(rows["quat_world_imu"]).as_euler("ZYX")[:, 0])
+    # Trapezoids over 20 samples between two zeros: 20 steps of 0.1 rad.
+    assert yaw[-1] - yaw[0] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_clock_that_jumps_ahead_is_a_gap_from_which_the_estimate_recovers(ordinary):
+    imu, mag, truth, _ = ordinary
+    later = imu.stamp[0] + int(30e9)
+    jump = 3_600_000_000_000
+    def moved(stamp):
+        return np.where(stamp >= later, stamp + jump, stamp)
+    rows = OrientationEstimator().run(ImuLog(moved(imu.stamp), imu.gyr, imu.acc),
+                                      MagLog(moved(mag.stamp), mag.mag))
+    assert len(rows) == len(imu.stamp)
+    first = int(np.searchsorted(imu.stamp, later))
+    assert rows["flags"][first] & FLAG_GAP
+    # An hour unseen: nothing is known of the attitude, and the covariance says so.
+    assert np.sqrt(rows["cov_attitude"][first, 2, 2]) > 1.0
+    error = np.degrees(np.linalg.norm(local_errors(rows, truth), axis=1))
+    assert error[first + 2000:].max() < 3.0
 
 
 def test_bias_estimation_can_be_switched_off(ordinary):
