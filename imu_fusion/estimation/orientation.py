@@ -6,7 +6,7 @@ time or a whole log at once, the same kernel runs in the same order.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from imu_fusion.estimation.orientation_alignment import align, usable_mags
 from imu_fusion.estimation.orientation_lag import FixedLag
 from imu_fusion.estimation.orientation_smoother import smooth
 from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_rotate
 from imu_fusion.parameters import Parameters, param
 
 # Rotation from ENU to the world frame that is published, xyzw.
@@ -27,6 +28,8 @@ _WORLD_FRAMES = {
     "ned": (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
 }
 _CHUNK = 256
+_COUNTERS = (st.IMU_USED, st.IMU_REJECTED, st.MAG_USED, st.MAG_REJECTED, st.MAG_LATE,
+             st.MAG_DISTURBED, st.GAPS, st.SATURATED, st.MAG_SATURATED)
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,9 @@ class OrientationParams(Parameters):
                                doc="Magnetometer samples that arrive later are dropped.")
     max_gap: float = param(0.1, unit="s", low=1e-3,
                            doc="A longer step between Imu samples counts as a gap.")
+    restart_gap: float = param(1.0, unit="s", low=1e-2,
+                               doc="After a longer one the attitude is anybody's guess: the estimator "
+                                   "aligns anew.")
     gap_rate_sd: float = param(1.0, unit="rad/s", low=0,
                                doc="Rate that may have gone unseen in a gap.")
 
@@ -200,6 +206,11 @@ class OrientationEstimator:
 
     def reset(self):
         """Forget all samples: the next ones start a new alignment."""
+        self._counted = np.zeros(self._kernel.K_SIZE, dtype=np.int64)
+        self._yaw = 0.0
+        self._forget()
+
+    def _forget(self):
         self._x = np.zeros(self._kernel.X_SIZE)
         self._k = np.zeros(self._kernel.K_SIZE, dtype=np.int64)
         self._waiting = []
@@ -218,6 +229,10 @@ class OrientationEstimator:
         """
         self._sample[:3] = gyr
         self._sample[3:] = acc
+        last = self._last_imu()
+        if (last is not None and stamp - last > self._restart_gap
+                and st.is_imu_sample(self._sample)):
+            return np.concatenate([self._restart(), self.add_imu(stamp, gyr, acc)])
         if self._alignment is None:
             return self._wait_imu(stamp)
         return self._step(stamp)
@@ -270,6 +285,18 @@ class OrientationEstimator:
         """
         mag_stamps = np.empty(0, dtype=np.int64) if mag is None else mag.stamp
         mags = np.empty((0, 3)) if mag is None else mag.mag
+        parts = []
+        i = j = 0
+        for cut in self._restarts(imu):
+            # A magnetometer sample comes before the Imu sample of its own stamp.
+            end = max(int(np.searchsorted(mag_stamps, imu.stamp[cut], side="right")), j)
+            parts += [self._run(imu[i:cut], mag_stamps[j:end], mags[j:end]), self._restart()]
+            i, j = cut, end
+        rows = self._run(imu[i:], mag_stamps[j:], mags[j:])
+        return np.concatenate([*parts, rows]) if parts else rows
+
+    def _run(self, imu, mag_stamps, mags):
+        """:meth:`run` without a restart."""
         if self.params.mode == "smoothed":
             return self._run_smoothed(imu, mag_stamps, mags)
         parts = []
@@ -287,9 +314,46 @@ class OrientationEstimator:
         return np.concatenate([*parts, self._run_kernel(
             imu.stamp[i:], np.hstack([imu.gyr[i:], imu.acc[i:]]), mag_stamps[j:], mags[j:])])
 
+    def _restarts(self, imu):
+        """Indices of the samples before which the estimator starts anew."""
+        good = np.flatnonzero(st.are_imu_samples(np.hstack([imu.gyr, imu.acc])))
+        newest = np.maximum.accumulate(imu.stamp[good])
+        last = self._last_imu()
+        before = np.append(newest[:1] if last is None else last, newest[:-1])
+        before = np.maximum(before, before[:1])
+        return good[imu.stamp[good] - before > self._restart_gap].tolist()
+
+    @property
+    def _restart_gap(self):
+        return int(self.params.restart_gap * 1e9)
+
+    def _last_imu(self):
+        """Stamp of the newest Imu sample taken, or None."""
+        if self._alignment is not None:
+            return int(self._k[st.LAST_STAMP])
+        return next((s for s, v in reversed(self._waiting) if len(v) == 6), None)
+
+    def _restart(self):
+        """After a gap in which anything can have happened: rows that still wait, then align
+        anew, at the yaw of before if nothing tells another."""
+        rows = self.finish()
+        if self._alignment is not None:
+            east = quat_rotate(self._x[st.Q:st.Q + 4], np.array([1.0, 0.0, 0.0]))
+            self._yaw = math.atan2(east[1], east[0])
+        corrected = None if self._lag is None else self._lag.take()
+        for counter in _COUNTERS:
+            self._counted[counter] += self._k[counter]
+        self._counted[st.GAPS] += 1
+        self._forget()
+        self._k[st.MAG_FLAGS] |= st.FLAG_GAP
+        if self._lag is not None:
+            self._lag.keep(corrected)
+        return rows
+
     def get_state(self):
         """A snapshot for :meth:`set_state`: going on from it changes nothing."""
         return dict(x=self._x.copy(), k=self._k.copy(), waiting=list(self._waiting),
+                    counted=self._counted.copy(), yaw=self._yaw,
                     alignment=self._alignment,
                     lag=None if self._lag is None else self._lag.copy())
 
@@ -307,16 +371,17 @@ class OrientationEstimator:
         self._waiting = list(state["waiting"])
         self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
         self._alignment = state["alignment"]
+        self._counted, self._yaw = state["counted"].copy(), state["yaw"]
         self._lag = None if state["lag"] is None else state["lag"].copy()
 
     @property
     def mag_saturated(self):
         """How many magnetometer samples were refused with an axis at its limit."""
-        return int(self._k[st.MAG_SATURATED])
+        return int(self._k[st.MAG_SATURATED] + self._counted[st.MAG_SATURATED])
 
     def summary(self):
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
-        k, x, a = self._k, self._x, self._alignment
+        k, x, a = self._k + self._counted, self._x, self._alignment
         counts = dict(
             method=self.params.method, aligned=a is not None, imu_used=int(k[st.IMU_USED]),
             imu_rejected=int(k[st.IMU_REJECTED]), mag_used=int(k[st.MAG_USED]),
@@ -375,7 +440,7 @@ class OrientationEstimator:
             raise EstimationError("mode 'smoothed' needs the whole recording in one run(); "
                                   "reset() first, or use mode 'causal'")
         samples = np.hstack([imu.gyr, imu.acc])
-        good = np.array([st.is_imu_sample(sample) for sample in samples], dtype=bool)
+        good = st.are_imu_samples(samples)
         if not good.any():
             return self._chunk[:0]
         origin = imu.stamp[np.argmax(good)]
@@ -414,6 +479,11 @@ class OrientationEstimator:
             declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
             gyr_density=p.gyro_noise_density, gyr_bias_sd=p.gyro_bias_sd,
             acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
+        if not self._alignment.has_heading and self._yaw:
+            east = quat_rotate(self._alignment.quat_world_imu, np.array([1.0, 0.0, 0.0]))
+            turn = quat_exp(np.array([0.0, 0.0, self._yaw - math.atan2(east[1], east[0])]))
+            self._alignment = replace(self._alignment, quat_world_imu=quat_multiply(
+                turn, self._alignment.quat_world_imu))
         self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - self._par[st.P_GYR_DELAY]
         self._kernel.initialise(self._x, self._k, par, self._alignment)
         self._k[st.ALIGN_UNTIL] = stamps[-1]

@@ -70,6 +70,10 @@ class FixedLag:
         while self._windows:
             self._correct(par)
 
+    def keep(self, rows):
+        """Rows of before that nobody has taken yet."""
+        self._rows.insert(0, rows)
+
     def take(self):
         """Corrected rows since the last call, ORIENTATION_DTYPE."""
         rows, self._rows = self._rows, []

@@ -82,7 +82,7 @@ HISTORY_STAMPS = 14
 PENDING_STAMPS = HISTORY_STAMPS + HISTORY_LENGTH
 MAG_INTS = PENDING_STAMPS + PENDING_LENGTH  # of orientation_mag_limit
 MAG_SATURATED = MAG_INTS + limit.INTS
-MAG_FLAGS = MAG_SATURATED + 1               # of the samples since the last row
+MAG_FLAGS = MAG_SATURATED + 1               # flags that wait for the next row
 K_COMMON = MAG_FLAGS + 1
 
 # Parameters common to all kernels, one float64 array.
@@ -115,6 +115,15 @@ def _is_within(v, bound):
 def is_imu_sample(sample):
     """Whether (6,) rate rad/s and specific force m/s^2 are numbers that a sensor can report."""
     return _is_within(sample[:3], _WILD_RATE) and _is_within(sample[3:6], _WILD_FORCE)
+
+
+@njit(cache=True)
+def are_imu_samples(samples):
+    """:func:`is_imu_sample` of each row of (n, 6)."""
+    result = np.empty(len(samples), dtype=np.bool_)
+    for i in range(len(samples)):
+        result[i] = is_imu_sample(samples[i])
+    return result
 
 
 @njit(cache=True)
