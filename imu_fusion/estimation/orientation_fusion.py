@@ -30,8 +30,8 @@ from imu_fusion.estimation.orientation_fusion_field import (
     collect_mags, start_field, update_mag)
 from imu_fusion.estimation.orientation_fusion_layout import (
     ACC_LAST, BLOCK_MAGS, BLOCK_START, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT,
-    MAG_ROWS, MAG_SUM, MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK, P_ESTIMATE_BIAS, P_EXCESS_WALK,
-    P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD,
+    MAG_ROWS, MAG_SUM, MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK,
+    P_ESTIMATE_BIAS, P_EXCESS_WALK, P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD,
     P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD, P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME,
     REST_SINCE, S, SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
 from imu_fusion.estimation.orientation_state import push_mag

@@ -35,8 +35,9 @@ class Stream:
         emit: called as ``emit(topic, stamp, cdr)`` with every message made.
         warn: called with a text when something is wrong with the input.
 
-    Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement ``restart`` (forget everything), ``take`` (one sample),
-    ``flush`` (emit what is held back) and ``look_at`` (texts about first samples).
+    Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement
+    ``restart`` (forget everything), ``take`` (one sample), ``flush`` (emit what is held back) and
+    ``look_at`` (texts about first samples).
     """
 
     same_frame = ()

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation_state import FLAG_ALIGNING, FLAG_GAP
 from imu_fusion.samples.logs import ImuLog, MagLog
-from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.simulation.rotation import Tumbling, simulate
 from test.estimation.test_orientation import NOISY, errors_deg, feed
 
 HOUR = 3_600_000_000_000

@@ -26,7 +26,8 @@ from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from test.nodes.conftest import START, STEP, collector
 
 OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool,
-           "/imu/data_smoothed": Imu, "/imu/flags": DiagnosticArray, "/imu/gyro_bias": TwistWithCovarianceStamped}
+           "/imu/data_smoothed": Imu, "/imu/flags": DiagnosticArray,
+           "/imu/gyro_bias": TwistWithCovarianceStamped}
 NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
 
 

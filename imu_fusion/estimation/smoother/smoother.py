@@ -117,7 +117,8 @@ class Smoother:
                                              frame.height, decimal_year(fix.stamp[0]))
         return iterated.Problem(
             imu=prepared, params=p, measurements=measurements, gravity=gravity,
-            earth_rate=earth_rate_world(frame.latitude_deg), field_world=np.array(field) * 1e6, constraints=constraints, layout=layout,
+            earth_rate=earth_rate_world(frame.latitude_deg), field_world=np.array(field) * 1e6,
+            constraints=constraints, layout=layout,
             prior_sd=sd, decay_rate=decay, walk=walk)
 
     def _first_attitudes(self, problem, mag, initial_quat):
