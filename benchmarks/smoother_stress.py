@@ -88,6 +88,13 @@ def main():
                           gnss_position_error_tau=30.0)
     row("95 % Gauss-Markov GNSS error, states", gnss=wander, params=states)
     row("the same, no hill", gnss=wander, params=states, surface=None)
+    filtered = GnssErrors(velocity_tau=1.0)
+    row("95 % Gauss-Markov GNSS velocity error, white model", gnss=filtered)
+    sd_velocity = np.array(base.velocity_sd)
+    states = base.replace(gnss_velocity_error_sd=tuple(np.sqrt(0.95) * sd_velocity),
+                          gnss_velocity_error_tau=1.0)
+    row("95 % Gauss-Markov GNSS velocity error, states", gnss=filtered, params=states)
+    row("that, no hill", gnss=filtered, params=states, surface=None)
     row("events given 0.15 s early", events=shifted(-0.15))
     row("events given 0.15 s late", events=shifted(0.15))
     row("gyroscope clipped at 2.5 rad/s", phone=PhoneErrors(gyr_range=2.5),

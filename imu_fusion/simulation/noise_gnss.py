@@ -15,10 +15,12 @@ class GnssErrors(Parameters):
                                            unit="m", low=0, length=3)
     position_tau: float = param(0.0, doc="Correlation time of the position error (first-order "
                                 "Gauss-Markov); 0: white", unit="s", low=0)
-    correlated_share: float = param(0.95, doc="Share of the position variance that is "
-                                    "correlated when position_tau is set", low=0, high=1)
+    correlated_share: float = param(0.95, doc="Share of the variance that is correlated when "
+                                    "position_tau or velocity_tau is set", low=0, high=1)
     velocity_sd: tuple[float, ...] = param((0.1, 0.1, 0.3), doc="Velocity error", unit="m/s",
                                            low=0, length=3)
+    velocity_tau: float = param(0.0, doc="Correlation time of the velocity error; 0: white",
+                                unit="s", low=0)
     outlier_share: float = param(0.0, doc="Share of fixes and velocities that are outliers",
                                  low=0, high=1)
     outlier_factor: float = param(10.0, doc="Standard deviations of an outlier, in units of "
@@ -39,17 +41,22 @@ def gauss_markov(times, sd, tau, rng):
     return error
 
 
+def _errors(times, sd, tau, share, rng):
+    """White errors (n, 3), or with a correlation time ``share`` of their variance wandering."""
+    white = len(times), 3
+    if tau <= 0.0:
+        return sd * rng.standard_normal(white)
+    return (gauss_markov(times, sd * np.sqrt(share), tau, rng)
+            + np.sqrt(1.0 - share) * sd * rng.standard_normal(white))
+
+
 def gnss_errors(times, errors, rng):
     """Position (n, 3) and velocity (n, 3) errors at times (n,) s."""
     n = len(times)
     sd = np.array(errors.position_sd)
-    if errors.position_tau > 0.0:
-        share = errors.correlated_share
-        position = (gauss_markov(times, sd * np.sqrt(share), errors.position_tau, rng)
-                    + np.sqrt(1.0 - share) * sd * rng.standard_normal((n, 3)))
-    else:
-        position = sd * rng.standard_normal((n, 3))
-    velocity = np.array(errors.velocity_sd) * rng.standard_normal((n, 3))
+    position = _errors(times, sd, errors.position_tau, errors.correlated_share, rng)
+    velocity = _errors(times, np.array(errors.velocity_sd), errors.velocity_tau,
+                       errors.correlated_share, rng)
     for error, nominal in ((position, sd), (velocity, np.array(errors.velocity_sd))):
         bad = rng.random(n) < errors.outlier_share
         error[bad] = (errors.outlier_factor * nominal

@@ -130,6 +130,26 @@ def test_wandering_position_error_needs_its_state(jump):
     assert "gnss_position_error" in r.states
 
 
+def test_filtered_velocities_need_their_state(jump):
+    """A receiver's filter makes its velocity errors wander: as white ones they are believed too
+    much."""
+    sd = tuple(np.sqrt(0.95) * np.array(SmootherParams().velocity_sd))
+    models = (SmootherParams(), SmootherParams(gnss_velocity_error_sd=sd,
+                                               gnss_velocity_error_tau=1.0))
+    found = []
+    for seed in range(4):
+        filtered = record(jump, np.random.default_rng(seed), gnss=GnssErrors(velocity_tau=1.0))
+        truth = filtered.motion.vel_world
+        for params in models:
+            r = Smoother(params).run(filtered.imu, filtered.mag, filtered.fix, filtered.velocity)
+            error = r.samples["vel_world"] - truth
+            found.append(np.einsum("ni,ni->n", error, np.linalg.solve(
+                r.samples["cov_velocity"], error[..., None])[..., 0]).mean())
+    white, states = np.mean(np.reshape(found, (4, 2)), axis=0)
+    # Ideal 3; ten seeds of the benchmark give 36 and 3.2.
+    assert white > 10.0 and 1.0 < states < 6.0
+
+
 def test_jittered_stamps_of_even_fixes_are_put_back():
     rng = np.random.default_rng(0)
     epoch = np.delete(np.arange(500), [7, 8, 100, 250])
