@@ -45,16 +45,23 @@ def compensated(imu, mag):
             MagLog(mag.stamp, advance(mag, "mag", MAG_DELAY)))
 
 
+def _field(mag):
+    """What VQF takes for a magnetometer, or None, and the name of its result."""
+    return (None, "quat6D") if mag is None else (mag.mag * 1e6, "quat9D")
+
+
 def vqf(imu, mag, tau_acc=3.0, tau_mag=9.0):
     dt = (imu.stamp[-1] - imu.stamp[0]) * 1e-9 / (len(imu) - 1)
-    out = VQF(dt, tauAcc=tau_acc, tauMag=tau_mag).updateBatch(imu.gyr, imu.acc, mag.mag * 1e6)
-    return out["quat9D"][:, [1, 2, 3, 0]]
+    field, key = _field(mag)
+    out = VQF(dt, tauAcc=tau_acc, tauMag=tau_mag).updateBatch(imu.gyr, imu.acc, field)
+    return out[key][:, [1, 2, 3, 0]]
 
 
 def offline_vqf(imu, mag, tau_acc=3.0, tau_mag=9.0):
     dt = (imu.stamp[-1] - imu.stamp[0]) * 1e-9 / (len(imu) - 1)
-    out = offlineVQF(imu.gyr, imu.acc, mag.mag * 1e6, dt, dict(tauAcc=tau_acc, tauMag=tau_mag))
-    return out["quat9D"][:, [1, 2, 3, 0]]
+    field, key = _field(mag)
+    out = offlineVQF(imu.gyr, imu.acc, field, dt, dict(tauAcc=tau_acc, tauMag=tau_mag))
+    return out[key][:, [1, 2, 3, 0]]
 
 
 def madgwick(imu, mag):

@@ -16,6 +16,7 @@ RESULTS = Path(__file__).parent / "results"
 IN_README = {
     "orientation_broad": "Orientation on BROAD (9 trials, optical reference)",
     "orientation_clipping": "Saturated gyroscopes",
+    "orientation_vehicles": "Tilt on a car and an aeroplane",
     "orientation_speed": "Speed of the orientation step",
     "replay": "Ten minutes at rate 0 through replayer, orientation_estimator and recorder",
     "acceleration_field_independent": "Acceleration field of the simulated impact, independent noise",
