@@ -314,7 +314,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
         var_gyr[i] = par[P_GYR_DENSITY] ** 2 / noise_dt + bias_var[i]
         if (clipped >> i) & 1:
             var_gyr[i] += x[LIMIT + i] ** 2
-            if weight > 0.0:
+            if weight > 0.0 and dt > 0.0:
                 rate_next[i] = phi[i] / dt
     write_row(row, row_int, par, stamp, x[Q:Q + 4], cov[:3, :3], rate_next, var_gyr, acc,
               par[P_ACC_DENSITY] ** 2 / noise_dt + par[P_ACC_BIAS_SD] ** 2, bias, bias_var,

@@ -72,7 +72,7 @@ class Smoother:
             result = self._result(attempt, frame, hill, *outcome)
             if best is None or result.cost[-1] < best.cost[-1]:
                 best = result
-            if result.converged and result.misfit()["fix"] < _PLAUSIBLE:
+            if result.converged and result.misfit().get("fix", np.inf) < _PLAUSIBLE:
                 break
         if best is None:
             raise EstimationError("the smoother diverged: noise far below that of the data, or "
