@@ -42,7 +42,7 @@ from imu_fusion.geometry.rotation import (
 __all__ = ["K_SIZE", "P_SIZE", "X_SIZE", "advance", "initialise", "pack", "push_mag", "run_loop",
            "step_imu"]
 
-_SWAY_TIME = 10.0          # s: velocity changes faster than this show in SWAY
+_SWAY_TIME = 5.0           # s: velocity changes faster than this show in SWAY
 _MOTION_TIME = 10.0        # s: over which the size of the motion is judged
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
