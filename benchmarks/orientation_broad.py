@@ -125,7 +125,7 @@ def leave_one_out(errors):
 def peers_of_last_run():
     """The table's lines of peers as the last whole run wrote them."""
     lines = (RESULTS / "orientation_broad.md").read_text().splitlines()
-    cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")][1:]
+    cells = [line[2:-2].split(" | ") for line in lines if line.startswith("| ")][1:]
     return [row for row in cells if not row[0].startswith(("fusion", "gyro_mag"))]
 
 

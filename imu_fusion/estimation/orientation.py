@@ -19,7 +19,7 @@ from imu_fusion.estimation.orientation_lag import FixedLag
 from imu_fusion.estimation.orientation_params import OrientationParams
 from imu_fusion.estimation.orientation_smoother import smooth
 from imu_fusion.estimation.orientation_state import ORIENTATION_DTYPE
-from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_rotate
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_to_rpy
 
 # Rotation from ENU to the world frame that is published, xyzw.
 _WORLD_FRAMES = {
@@ -113,7 +113,9 @@ class OrientationEstimator:
                 self._k[st.MAG_REJECTED] += 1
         else:
             self._kernel.push_mag(self._x, self._k, self._par, stamp, self._mag)
-            if self._lag is not None:
+            # While no Imu comes, none is kept: after that gap all starts anew.
+            if (self._lag is not None
+                    and stamp - int(self._k[st.LAST_STAMP]) <= self._restart_gap):
                 self._lag.add((), None, np.array([stamp]), self._mag.copy()[None])
         return self._chunk[:0]
 
@@ -204,8 +206,7 @@ class OrientationEstimator:
         anew, at the yaw of before if nothing tells another."""
         rows = self.finish()
         if self._alignment is not None:
-            east = quat_rotate(self._x[st.Q:st.Q + 4], np.array([1.0, 0.0, 0.0]))
-            self._yaw = math.atan2(east[1], east[0])
+            self._yaw = quat_to_rpy(self._x[st.Q:st.Q + 4])[2]
         corrected = None if self._lag is None else self._lag.take()
         for counter in _COUNTERS:
             self._counted[counter] += self._k[counter]
@@ -290,7 +291,7 @@ class OrientationEstimator:
         self._next = 0
 
     def _wait_imu(self, stamp):
-        last = next((s for s, v in reversed(self._waiting) if len(v) == 6), None)
+        last = self._last_imu()
         if not st.is_imu_sample(self._sample) or (last is not None and stamp <= last):
             self._k[st.IMU_REJECTED] += 1
             return self._chunk[:0]
@@ -346,10 +347,9 @@ class OrientationEstimator:
             gyr_density=p.gyro_noise_density, gyr_bias_sd=p.gyro_bias_sd,
             acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
         if not self._alignment.has_heading and self._yaw:
-            east = quat_rotate(self._alignment.quat_world_imu, np.array([1.0, 0.0, 0.0]))
-            turn = quat_exp(np.array([0.0, 0.0, self._yaw - math.atan2(east[1], east[0])]))
+            turn = self._yaw - quat_to_rpy(self._alignment.quat_world_imu)[2]
             self._alignment = replace(self._alignment, quat_world_imu=quat_multiply(
-                turn, self._alignment.quat_world_imu))
+                quat_exp(np.array([0.0, 0.0, turn])), self._alignment.quat_world_imu))
         self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - self._par[st.P_GYR_DELAY]
         self._kernel.initialise(self._x, self._k, par, self._alignment)
         self._k[st.ALIGN_UNTIL] = stamps[-1]

@@ -31,9 +31,9 @@ from imu_fusion.estimation.orientation_fusion_field import (
 from imu_fusion.estimation.orientation_fusion_layout import (
     ACC_LAST, BLOCK_MAGS, BLOCK_START, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT,
     MAG_ROWS, MAG_SUM, MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK,
-    P_ESTIMATE_BIAS, P_EXCESS_WALK, P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD,
-    P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD, P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME,
-    REST_SINCE, S, SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
+    P_ESTIMATE_BIAS, P_EXCESS_WALK, P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD,
+    P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD, P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD,
+    P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME, REST_SINCE, S, SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
 from imu_fusion.estimation.orientation_state import push_mag
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_normalize, quat_to_matrix)
@@ -212,7 +212,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
 
     clipped = find_limits(x, k, par, gyr)
     if clipped:
-        flags |= st.FLAG_SATURATED | clipped << st.FLAG_SATURATED_AXES
+        flags |= st.FLAG_SATURATED | clipped << st.SATURATED_AXES_SHIFT
         k[st.SATURATED] += 1
     k[CLIPPED] |= clipped
 

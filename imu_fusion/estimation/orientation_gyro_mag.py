@@ -24,7 +24,7 @@ from imu_fusion.estimation.orientation_fusion_detect import find_limits, start_l
 from imu_fusion.estimation.orientation_fusion_layout import LIMIT, P_ESTIMATE_BIAS, P_REST_FORCE
 from imu_fusion.estimation.orientation_state import (
     ALIGN_UNTIL, FIELD, FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING,
-    FLAG_SATURATED, FLAG_SATURATED_AXES, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, LAST_STAMP, MAG_USED,
+    FLAG_SATURATED, SATURATED_AXES_SHIFT, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, LAST_STAMP, MAG_USED,
     P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_GAP_RATE_SD, P_GYR_DENSITY,
     P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
     TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
@@ -247,7 +247,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
         gap_variance = min((par[P_GAP_RATE_SD] * dt) ** 2, UNIFORM_VARIANCE)
     clipped = find_limits(x, k, par, gyr)
     if clipped:
-        flags |= FLAG_SATURATED | clipped << FLAG_SATURATED_AXES
+        flags |= FLAG_SATURATED | clipped << SATURATED_AXES_SHIFT
         k[SATURATED] += 1
 
     # The step: gyroscope alone, or with the magnetometer samples that came.

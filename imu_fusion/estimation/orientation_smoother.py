@@ -149,7 +149,7 @@ def _smoothed_cov(cov, information):
 @njit(cache=True)
 def _clipped(row_int):
     """Bits of the gyroscope axes at their limit."""
-    return (row_int[st.FLAGS_WORD] >> st.FLAG_SATURATED_AXES) & 7
+    return (row_int[st.FLAGS_WORD] >> st.SATURATED_AXES_SHIFT) & 7
 
 
 @njit(cache=True)

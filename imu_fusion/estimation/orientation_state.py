@@ -45,7 +45,8 @@ FLAG_ALIGNING = 32      # inside the interval from which the initial orientation
 FLAG_NO_HEADING = 64    # no magnetometer sample has fixed the heading yet
 FLAG_MAG_SATURATED = 128  # a magnetometer sample was refused: an axis is at its limit
 FLAG_HELD = 2048          # a rate that nothing before resembles: the one before stands in for it
-FLAG_SATURATED_AXES = 8   # by how many bits those of x, y, z are shifted: 256, 512, 1024
+# Beside FLAG_SATURATED, one bit for each axis at its limit, x first: 256, 512, 1024.
+SATURATED_AXES_SHIFT = 8
 
 UNIFORM_VARIANCE = math.pi ** 2 / 3.0   # rad^2, of an angle about which nothing is known
 

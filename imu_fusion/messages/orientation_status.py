@@ -25,6 +25,7 @@ WORDS = {st.FLAG_ALIGNING: "aligning", st.FLAG_STILL: "at rest",
          st.FLAG_NO_HEADING: "heading unknown", st.FLAG_MAG_DISTURBED: "magnetic disturbance",
          st.FLAG_MAG_SATURATED: "magnetometer at its limit",
          st.FLAG_SATURATED: "gyroscope at its limit", st.FLAG_GAP: "samples missing"}
+_LASTING = sum(WORDS)
 _WORRIES = ~(st.FLAG_ALIGNING | st.FLAG_STILL)
 _MAG_FLAGS = st.FLAG_MAG_DISTURBED | st.FLAG_MAG_SATURATED
 _MAG_SEEN = _MAG_FLAGS | st.FLAG_MAG_USED
@@ -35,7 +36,7 @@ def lasting_flags(flags, before):
     the next one. before: the result for the row before."""
     if not flags & _MAG_SEEN:
         flags |= before & _MAG_FLAGS
-    return flags & sum(WORDS)
+    return flags & _LASTING
 
 
 def flags_message(stamp, frame_id, flags):

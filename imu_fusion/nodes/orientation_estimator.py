@@ -18,7 +18,7 @@ from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
 
 
-def transform_broadcast(node, output):
+def transform_broadcast(node):
     """The function that broadcasts a TransformStamped.
 
     Raises:
@@ -57,7 +57,7 @@ class OrientationEstimatorNode(EstimatorNode):
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         output = self.params(OrientationOutputParams)
-        self._broadcast = transform_broadcast(self, output) if output.publish_tf else None
+        self._broadcast = transform_broadcast(self) if output.publish_tf else None
         warm_up(self.params(OrientationParams))
         self.attach(OrientationStream(
             self.params(OrientationParams), output, self.emit,

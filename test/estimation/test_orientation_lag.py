@@ -95,3 +95,15 @@ def test_a_lag_needs_the_causal_fusion_filter():
     for changes in (dict(method="gyro_mag"), dict(mode="smoothed")):
         with pytest.raises(ParameterError, match="'lag'"):
             OrientationParams(lag=1.0, **changes)
+
+
+def test_a_magnetometer_alone_is_not_hoarded(recording):
+    """The Imu falls silent: what comes after the gap starts anew, so nothing need be kept."""
+    imu, mag, _, _ = recording
+    estimator = OrientationEstimator(LAG)
+    estimator.run(imu[:600], mag[mag.stamp <= imu.stamp[599]])
+    for i in range(10_000):
+        estimator.add_mag(int(imu.stamp[599]) + (i + 1) * 20_000_000, mag.mag[0])
+    kept = sum(len(stamps) for window in estimator._lag._windows for stamps, _ in window.mags)
+    # Two windows of 0.7 s and the restart gap of 1 s at 50 Hz.
+    assert kept < 200
