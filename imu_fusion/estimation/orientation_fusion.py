@@ -43,7 +43,8 @@ __all__ = ["K_SIZE", "P_SIZE", "X_SIZE", "advance", "initialise", "pack", "push_
            "step_imu"]
 
 _SWAY_TIME = 5.0           # s: velocity changes faster than this show in SWAY
-_MOTION_TIME = 10.0        # s: over which the size of the motion is judged
+_MOTION_TIME = 30.0        # s: over which the size of the motion is judged
+_MOTION_SDS2 = 4.0         # squared standard deviations beyond which it is believed at once
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
 _BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
@@ -99,6 +100,29 @@ def _rate(x, gyr):
 
 
 @njit(cache=True)
+def _motion_scale(x, par, cov, move):
+    """Factor by which velocities exceed the stated ones, at least 1.
+
+    A body that moves more than was said is believed: a vehicle is not held by a hand.
+    Judged by the axis that moves most, less what gravity feigns at a wrong tilt. Large motion is
+    believed at once, before it can turn the vertical; moderate motion if it lasts.
+    """
+    time = move[es.MOVE_TIME]
+    keep = math.exp(-time / _SWAY_TIME)
+    motion = 0.0
+    for i in range(3):
+        change = move[es.MOVE_FORCE + i] - (x[GRAVITY] * time if i == 2 else 0.0)
+        x[SWAY + i] = keep * x[SWAY + i] + par[P_USE_ACC] * change
+        feigned = 0.0
+        if i < 2:
+            tilt = es.ATT + 1 - i
+            feigned = cov[tilt, tilt] * (x[GRAVITY] * _SWAY_TIME) ** 2
+        motion = max(motion, (x[SWAY + i] ** 2 - feigned) / par[P_VEL_SD] ** 2)
+    x[MOTION] += min(time / _MOTION_TIME, 1.0) * (motion - x[MOTION])
+    return math.sqrt(max(x[MOTION], motion / _MOTION_SDS2, 1.0))
+
+
+@njit(cache=True)
 def _end_block(x, k, par, still, back, tape):
     """Prediction and updates over the collected block.
 
@@ -128,16 +152,7 @@ def _end_block(x, k, par, still, back, tape):
         tape[es.TAPE_MOVE:es.TAPE_MOVE + es.MOVE_SIZE] = move
     es.predict(cov, move)
 
-    # A body that moves more than was said is believed: a vehicle is not held by a hand.
-    motion = 0.0
-    for i in range(3):
-        change = move[es.MOVE_FORCE + i] - (x[GRAVITY] * time if i == 2 else 0.0)
-        x[SWAY + i] = math.exp(-time / _SWAY_TIME) * x[SWAY + i] + par[P_USE_ACC] * change
-        motion += x[SWAY + i] ** 2 / 3.0
-    x[MOTION] += min(time / _MOTION_TIME, 1.0) * (motion - x[MOTION])
-    # At equal accelerations times grow as velocities do, and extents as their square.
-    scale = math.sqrt(max(x[MOTION] / par[P_VEL_SD] ** 2, 1.0))
-
+    scale = _motion_scale(x, par, cov, move)
     error = np.zeros(N)
     index = np.empty(es.OP_WIDTH, dtype=np.int64)
     row = np.ones(es.OP_WIDTH)
@@ -145,6 +160,7 @@ def _end_block(x, k, par, still, back, tape):
         if (back >> i) & 1:
             index[0] = es.EXCESS + i
             es.update(cov, error, 1, index, row, -x[S + es.EXCESS + i], _BACK_SD ** 2, tape)
+    # At equal accelerations times grow as velocities do, and extents as their square.
     for i in range(3):
         index[0] = es.VEL + i
         variance = (_REST_SPEED_SD ** 2 * 0.02 / time if still

@@ -1,6 +1,7 @@
 """The fusion method on simulated motion with known errors of the sensors."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation_state import (
     FLAG_HELD, FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
+from imu_fusion.parameter_file import load
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import saturated_axes
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 
+CONFIG = Path(__file__).parents[2] / "config"
 MATRIX = ((1.004, 0.003, 0.0), (-0.002, 0.997, 0.001), (0.0, 0.003, 1.002))
 ORDINARY = Sensors(gyr_density=2e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005),
                    gyr_matrix=MATRIX, acc_bias=(0.02, -0.03, 0.01), mag_delay=0.011)
@@ -380,3 +383,37 @@ def test_iron_left_over_is_part_of_the_heading_that_rest_anchors():
     calibrated = OrientationParams(mag_matrix_sd=0.0, mag_offset_sd=0.0)
     rows = OrientationEstimator(calibrated).run(imu, mag)
     assert math.sqrt(rows["cov_attitude"][-1][2, 2]) < math.radians(1.5)
+
+
+VEHICLE = load(CONFIG / "orientation_vehicle.yaml")["orientation_estimator"]
+PHONE_GRADE = {k: VEHICLE[k] for k in ("acc_bias_sd", "gyro_scale_sd", "gyro_bias_walk")}
+
+
+def on_a_vehicle(seed):
+    """Speeds of some 10 m/s that last for some 10 s, sensors drawn from the preset."""
+    p = OrientationParams(**VEHICLE)
+    rng = np.random.default_rng(seed)
+    sensors = Sensors(
+        gyr_density=p.gyro_noise_density, acc_density=p.acc_noise_density,
+        gyr_bias=tuple(rng.normal(0, p.gyro_bias_sd, 3)), gyr_walk=p.gyro_bias_walk,
+        gyr_matrix=np.eye(3) + rng.normal(0, p.gyro_scale_sd, (3, 3)),
+        acc_bias=tuple(rng.normal(0, p.acc_bias_sd, 3)))
+    motion = Tumbling(seed=seed, rate_sd=0.1, frequencies=(0.01, 0.05), travel_sd=60.0, rest=5.0)
+    imu, _, truth, _ = simulate(motion, 200.0, rate=50.0, sensors=sensors, seed=seed)
+    return imu, truth
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+@pytest.mark.parametrize("told", [VEHICLE, PHONE_GRADE], ids=["preset", "sensors only"])
+def test_tilt_on_a_vehicle_is_as_good_as_stated(told, mode):
+    """Told of the motion, or finding out. Errors last for tens of seconds: one vehicle's mean
+    scatters by 0.6, that of ten by 0.2; bounds are three of these."""
+    ratios = []
+    for seed in range(10):
+        imu, truth = on_a_vehicle(seed)
+        rows = OrientationEstimator(OrientationParams(mode=mode, **told)).run(imu)
+        world = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+        cov = world @ rows["cov_attitude"] @ world.transpose(0, 2, 1)
+        variance = np.degrees(1) ** 2 * (cov[:, 0, 0] + cov[:, 1, 1])
+        ratios.append((tilt_errors_deg(rows, truth) ** 2 / variance).mean())
+    assert 0.4 < np.mean(ratios) < 1.6
