@@ -22,6 +22,7 @@ from imu_fusion.estimation.smoother.transition import boxminus
 _BEGINNING = 20_000_000_000   # ns, from which first attitudes are judged at least
 _HELD_SD = 1e-6               # s, of a delay that is not estimated yet
 _SETTLED = 0.01               # relative change of the cost with which delays are let go
+_NEAR = 3.0                   # tolerances: after such a step the next is likely the last
 _DELAY_SDS = 3.0              # standard deviations within which a delay of stamps is believed
 
 
@@ -149,7 +150,7 @@ class Problem:
 
 
 def solve(problem, events, refine):
-    """Iterate to convergence; the last step computes covariances.
+    """Iterate to convergence; the last step, or one more, computes covariances.
 
     Args:
         problem: Problem with ``prior`` and ``x`` set.
@@ -169,13 +170,15 @@ def solve(problem, events, refine):
     problem.prior_sd[delays] = _HELD_SD
     problem.follow()
     refined, converged, steps, changed = events is None, False, 0, 0
+    near, covariances, variances = False, (), ()
     while steps < params.max_iterations:
-        largest, _, _ = problem.step(events, margin)
-        steps += 1
-        if not np.isfinite(problem.cost[-1] + largest.sum()):
-            break
         if moving:
             problem.attach()
+        largest, covariances, variances = problem.step(events, margin, with_cov=near)
+        steps += 1
+        near = refined and not held and largest.max() <= _NEAR * params.tolerance
+        if not np.isfinite(problem.cost[-1] + largest.sum()):
+            break
         # A cost is that before its step: the first two after a change cannot be compared.
         change = np.inf
         if len(problem.cost) > changed + 1:
@@ -197,5 +200,8 @@ def solve(problem, events, refine):
             break
         events = better
     problem.prior_sd = prior_sd
-    _, covariances, variances = problem.step(events, margin, with_cov=True)
+    if not len(covariances):
+        if moving:
+            problem.attach()
+        _, covariances, variances = problem.step(events, margin, with_cov=True)
     return events, steps, converged, covariances, variances

@@ -20,7 +20,7 @@ from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE
                                                   LEVER_ARM, POS, VEL, VELOCITY, interval,
                                                   predict_fix, predict_mag, predict_velocity)
 from imu_fusion.estimation.smoother.transition import (adjoint_rows, apply_step, boxminus,
-                                                       boxplus, interval_noise,
+                                                       boxplus, interval_noise, propagate_cov,
                                                        propagate_rows, slow_noise)
 
 #: Longest list of non-zero entries of a row: all states, should one not be finite.
@@ -52,8 +52,9 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
         rows: constraints sorted by sample: start (N + 1,), residual, gradient, sigma, height.
         innovation: (M, 3) normalised innovations, result.
         storage: what the backward pass needs (:func:`make_storage`): entries, indices, count,
-            gain, value and start of the rows; deviation and covariance after the rows. Filled
-            unless it was made for no sample.
+            gain, value and start of the rows; deviation and covariance after the rows; rows
+            of the transition matrix and noise of the interval. Filled unless it was made for
+            no sample.
 
     Returns:
         Sum of the losses of all rows at the nominal trajectory.
@@ -61,14 +62,15 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
     stamps, inputs, noise, gravity, spin, rates, walks, layout, columns, field, lever_arm = motion
     m_start, m_kind, m_tau, m_value, m_whiten, m_loss = measured
     c_start, c_residual, c_gradient, c_sigma, c_height = rows
-    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
+    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov, s_vel, s_att,
+     s_spread) = storage
     store = len(s_delta) > 0
     n = len(delta)
     n_total = len(x)
     f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
     x_next, rate, force = np.empty(n + 1), np.empty(3), np.empty(3)
     rotation, middle, spread = np.eye(3), np.eye(3), np.empty((3, 3))
-    decay, work, work_t = np.ones(n), np.empty((n, n)), np.empty((n, n))
+    decay, work = np.ones(n), np.empty((n, n))
     column, column_out, defect = np.empty((n, 1)), np.empty((n, 1)), np.empty(n)
     h, row, gain, residual = np.zeros((3, n)), np.zeros(n), np.empty(n), np.empty(3)
     entries, used = np.empty(MAX_ENTRIES), np.empty(MAX_ENTRIES, np.int64)
@@ -178,12 +180,10 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             propagate_rows(column, column_out, dt, decay, f_vel, f_att, columns)
             for i in range(n):
                 delta[i] = column_out[i, 0] + defect[i]
-        propagate_rows(cov, work, dt, decay, f_vel, f_att, columns)
-        for i in range(n):
-            for j in range(n):
-                work_t[j, i] = work[i, j]
-        propagate_rows(work_t, cov, dt, decay, f_vel, f_att, columns)
+        propagate_cov(cov, work, dt, decay, f_vel, f_att, columns)
         interval_noise(noise[k, 3:6], middle, dt, spread)
+        if store:
+            s_vel[k - first], s_att[k - first], s_spread[k - first] = f_vel, f_att, spread
         for i in range(3):
             cov[ATT + i, ATT + i] += noise[k, i] * dt
             for j in range(3):
@@ -193,12 +193,6 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
                 cov[POS + i, POS + j] += 0.25 * dt * dt * spread[i, j]
         for i in range(9, n):
             cov[i, i] += slow_noise(walks[i], rates[i], dt, decay[i])
-        # The two products round differently on either side of the diagonal.
-        for i in range(n):
-            for j in range(i):
-                mean = 0.5 * (cov[i, j] + cov[j, i])
-                cov[i, j] = mean
-                cov[j, i] = mean
     return cost
 
 
@@ -258,12 +252,11 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
     Returns:
         Sum of the squared normalised process noise.
     """
-    stamps, inputs, noise, gravity, spin, rates, walks, layout, columns, _, _ = motion
-    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov) = storage
+    stamps, _, noise, _, _, rates, walks, _, columns, _, _ = motion
+    (r_entries, r_index, r_count, r_gain, r_value, r_start, s_delta, s_cov, s_vel, s_att,
+     s_spread) = storage
     n = len(adjoint)
-    f_vel, f_att = np.zeros((3, n)), np.zeros((3, n))
-    x_next, rate, force = np.empty(n + 1), np.empty(3), np.empty(3)
-    spread, decay = np.empty((3, 3)), np.ones(n)
+    decay = np.ones(n)
     column, column_out = np.empty((n, 1)), np.empty((n, 1))
     work, work_t = np.empty((n, n)), np.empty((n, n))
     u, quadratic = np.empty(n), 0.0
@@ -273,9 +266,7 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
             dt = stamps[k]
             for i in range(9, n):
                 decay[i] = 1.0 if rates[i] == 0.0 else math.exp(-rates[i] * dt)
-            _, middle = interval(x[k], inputs[k, 0:3], inputs[k, 3:6], dt, gravity, spin, decay,
-                                 layout, f_vel, f_att, x_next, rate, force)
-            interval_noise(noise[k, 3:6], middle, dt, spread)
+            f_vel, f_att, spread = s_vel[k - first], s_att[k - first], s_spread[k - first]
             for i in range(3):
                 cost += noise[k, i] * dt * adjoint[ATT + i] ** 2
                 for j in range(3):
@@ -369,7 +360,8 @@ def make_storage(n_samples, n_rows, n):
     return (np.empty((n_rows, MAX_ENTRIES)), np.empty((n_rows, MAX_ENTRIES), np.int64),
             np.empty(n_rows, np.int64), np.empty((n_rows, n)), np.empty(n_rows),
             np.empty(n_samples + 1, np.int64), np.empty((n_samples, n)),
-            np.empty((n_samples, n, n)))
+            np.empty((n_samples, n, n)), np.empty((n_samples, 3, n)),
+            np.empty((n_samples, 3, n)), np.empty((n_samples, 3, 3)))
 
 
 @njit(cache=True)

@@ -57,6 +57,70 @@ def propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
 
 
 @njit(cache=True)
+def propagate_cov(cov, work, dt, decay, f_vel, f_att, columns):
+    """cov = F @ cov @ F.T for a symmetric matrix (n, n), in place and exactly symmetric.
+
+    Slow states only decay, so that the rows of position, velocity and attitude are all that
+    has to be multiplied. work: (n, n) scratch.
+    """
+    n = len(cov)
+    for i in range(3):
+        for j in range(n):
+            work[VEL + i, j] = cov[VEL + i, j]
+            work[ATT + i, j] = 0.0
+    for c in columns:
+        v0, v1, v2 = f_vel[0, c], f_vel[1, c], f_vel[2, c]
+        a0, a1, a2 = f_att[0, c], f_att[1, c], f_att[2, c]
+        for j in range(n):
+            value = cov[c, j]
+            work[VEL, j] += v0 * value
+            work[VEL + 1, j] += v1 * value
+            work[VEL + 2, j] += v2 * value
+            work[ATT, j] += a0 * value
+            work[ATT + 1, j] += a1 * value
+            work[ATT + 2, j] += a2 * value
+    for i in range(3):
+        for j in range(n):
+            work[POS + i, j] = cov[POS + i, j] + 0.5 * dt * (cov[VEL + i, j] + work[VEL + i, j])
+    for i in range(9, n):
+        if decay[i] != 1.0:
+            for j in range(9, n):
+                cov[i, j] *= decay[i]
+                cov[j, i] *= decay[i]
+    for i in range(3):
+        for j in range(3):
+            both = 0.0
+            for c in columns:
+                both += work[VEL + i, c] * f_att[j, c]
+            cov[VEL + i, ATT + j] = cov[ATT + j, VEL + i] = both
+            if j > i:
+                continue
+            vel, att = work[VEL + i, VEL + j], 0.0
+            for c in columns:
+                vel += work[VEL + i, c] * f_vel[j, c]
+                att += work[ATT + i, c] * f_att[j, c]
+            cov[VEL + i, VEL + j] = cov[VEL + j, VEL + i] = vel
+            cov[ATT + i, ATT + j] = cov[ATT + j, ATT + i] = att
+    # Positions follow by the trapezoidal rule from velocities before and after.
+    for i in range(3):
+        for j in range(3):
+            cov[VEL + j, POS + i] = cov[POS + i, VEL + j] = (
+                work[VEL + j, POS + i]
+                + 0.5 * dt * (work[VEL + j, VEL + i] + cov[VEL + j, VEL + i]))
+            cov[ATT + j, POS + i] = cov[POS + i, ATT + j] = (
+                work[ATT + j, POS + i]
+                + 0.5 * dt * (work[ATT + j, VEL + i] + cov[ATT + j, VEL + i]))
+    for i in range(3):
+        for j in range(i + 1):
+            cov[POS + i, POS + j] = cov[POS + j, POS + i] = (
+                work[POS + i, POS + j]
+                + 0.5 * dt * (work[POS + i, VEL + j] + cov[POS + i, VEL + j]))
+    for i in range(9):
+        for j in range(9, n):
+            cov[i, j] = cov[j, i] = decay[j] * work[i, j]
+
+
+@njit(cache=True)
 def adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
     """out = F.T @ m for a matrix m (n, k)."""
     n, width = m.shape
