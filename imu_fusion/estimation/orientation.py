@@ -29,7 +29,8 @@ _WORLD_FRAMES = {
 }
 _CHUNK = 256
 _COUNTERS = (st.IMU_USED, st.IMU_REJECTED, st.MAG_USED, st.MAG_REJECTED, st.MAG_LATE,
-             st.MAG_DISTURBED, st.GAPS, st.SATURATED, st.MAG_SATURATED)
+             st.MAG_DISTURBED, st.GAPS, st.SATURATED, st.MAG_SATURATED,
+             st.RATES_HELD)
 
 
 def _axes(value, default):
@@ -255,7 +256,7 @@ class OrientationEstimator:
             mag_rejected=int(k[st.MAG_REJECTED]), mag_late=int(k[st.MAG_LATE]),
             mag_disturbed=int(k[st.MAG_DISTURBED]),
             mag_saturated=int(k[st.MAG_SATURATED]), gaps=int(k[st.GAPS]),
-            saturated=int(k[st.SATURATED]))
+            saturated=int(k[st.SATURATED]), rates_held=int(k[st.RATES_HELD]))
         if a is None:
             return counts
         bias = x[st.GYR_BIAS:st.GYR_BIAS + 3]

@@ -235,6 +235,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     missed = np.zeros(3)
     if not first and hold_spike(x, k, gyr, dt, missed):
         flags |= st.FLAG_HELD
+        k[st.RATES_HELD] += 1
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()
     raw = 0.5 * (last + gyr)

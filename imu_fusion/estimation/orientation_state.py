@@ -84,7 +84,8 @@ PENDING_STAMPS = HISTORY_STAMPS + HISTORY_LENGTH
 MAG_INTS = PENDING_STAMPS + PENDING_LENGTH  # of orientation_mag_limit
 MAG_SATURATED = MAG_INTS + limit.INTS
 MAG_FLAGS = MAG_SATURATED + 1               # flags that wait for the next row
-K_COMMON = MAG_FLAGS + 1
+RATES_HELD = MAG_FLAGS + 1
+K_COMMON = RATES_HELD + 1
 
 # Parameters common to all kernels, one float64 array.
 P_GYR_DELAY, P_MAX_LAG, P_MAX_GAP, P_GYR_DENSITY, P_ACC_DENSITY, P_ACC_BIAS_SD = range(6)

@@ -255,8 +255,10 @@ def test_single_wild_rates_do_not_turn_the_attitude(ordinary):
     wild[1:] &= ~wild[:-1]
     gyr = imu.gyr.copy()
     gyr[wild] += rng.choice([-1, 1], (wild.sum(), 3)) * rng.uniform(15, 40, (wild.sum(), 3))
-    rows = OrientationEstimator().run(ImuLog(imu.stamp, gyr, imu.acc), mag)
+    estimator = OrientationEstimator()
+    rows = estimator.run(ImuLog(imu.stamp, gyr, imu.acc), mag)
     assert (((rows["flags"] & FLAG_HELD) != 0) == wild).all() and wild.sum() > 20
+    assert estimator.summary()["rates_held"] == wild.sum()
     # Each would turn it by 15 to 40 rad/s times 5 ms, 4 to 11 deg.
     assert rmse_deg(rows, truth) < 1.1 * rmse_deg(OrientationEstimator().run(imu, mag), truth)
 
