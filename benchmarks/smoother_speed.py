@@ -154,7 +154,7 @@ def main():
             ("10 min, warm", 600, True), ("2 h, warm", 7200, True)]
     for name, seconds, warm in runs:
         wall, cpu, iterations, n, before, peak = measure(seconds, warm)
-        # The last pass, with covariances, is one more linear solve.
+        # Every iteration is one linear solve, the last one with covariances.
         lines.append(f"| {name} | {n} | {iterations} | {wall:.1f} | {cpu:.1f} | "
                      f"{1e6 * cpu / n / iterations:.1f} | {before:.0f}, {peak:.0f} |")
         print(lines[-1], flush=True)

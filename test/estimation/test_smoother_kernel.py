@@ -65,6 +65,22 @@ def test_transition_matches_differences():
     assert np.abs(f).max() > 0.1
 
 
+def test_covariance_is_carried_as_by_the_whole_matrix():
+    rng = np.random.default_rng(3)
+    x, gyr, acc = random_state(rng), rng.standard_normal(3), 10 * rng.standard_normal(3)
+    decay = np.ones(SIZE)
+    decay[9:] = rng.uniform(0.5, 1.0, SIZE - 9)
+    _, f_vel, f_att, *_ = carry(x, gyr, acc, 0.3, decay)
+    f = transition_matrix(x, gyr, acc, 0.3, decay)
+    root = rng.standard_normal((SIZE, SIZE))
+    cov = root @ root.T
+    expected = f @ cov @ f.T
+    transition.propagate_cov(cov, np.empty((SIZE, SIZE)), 0.3, decay, f_vel, f_att, COLUMNS)
+    # Sums of some 40 products: a few hundred roundings.
+    assert np.allclose(cov, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    assert (cov == cov.T).all()
+
+
 @pytest.mark.parametrize("kind", ["fix", "velocity", "mag"])
 def test_measurement_rows_match_differences(kind):
     rng = np.random.default_rng(1)
