@@ -9,7 +9,7 @@ few terms:
     dp'     = dv                                    position, m
 
 Gyroscope model: rate = gyr_raw + S gyr_raw - bias + excess, excess only on axes at
-their limit. Magnetometer model, relative to the field's norm:
+their limit; there dexcess' = dsurge, dsurge' = -dsurge / time (Singer 1970). Magnetometer model, relative to the field's norm:
 ``m_true = m - C m - offset`` and ``R m_true = field + local``, ``local`` being what
 distinguishes the place from its surroundings.
 
@@ -20,9 +20,9 @@ predictions and updates can be written to a tape, which the smoother reads backw
 import numpy as np
 from numba import njit
 
-ATT, BIAS, SCALE, VEL, POS, FIELD, LOCAL, OFFSET, ACC_BIAS, LAG, SOFT, EXCESS = (
-    0, 3, 6, 15, 18, 21, 24, 27, 30, 33, 34, 43)
-N = 46
+ATT, BIAS, SCALE, VEL, POS, FIELD, LOCAL, OFFSET, ACC_BIAS, LAG, SOFT, EXCESS, SURGE = (
+    0, 3, 6, 15, 18, 21, 24, 27, 30, 33, 34, 43, 46)
+N = 49
 
 # One prediction: integrals over the block, as one float array.
 MOVE_TIME = 0
@@ -32,7 +32,10 @@ MOVE_FORCE = 37        # (3,) of R f dt
 MOVE_EXCESS = 40       # (3, 3) of R dt over axes at their limit
 MOVE_LOCAL_KEEP = 49   # factor that LOCAL keeps
 MOVE_EXCESS_KEEP = 50  # (3,) 1 where the axis was at its limit before, else 0
-MOVE_NOISE = 53        # (N,) diagonal of the process noise
+MOVE_SURGE_KEEP = 53   # factor that SURGE keeps
+MOVE_SURGE_GAIN = 54   # s, of EXCESS per SURGE at the block's end
+MOVE_SURGE_MEAN = 55   # s, the same on average over the block
+MOVE_NOISE = 56        # (N,) diagonal of the process noise
 MOVE_SIZE = MOVE_NOISE + N
 
 # One scalar update on the tape: count, indices, coefficients, gain, variance, residual.
@@ -66,9 +69,9 @@ def _moved(move, column, out):
         turn = 0.0
         push = 0.0
         for j in range(3):
-            turn += (move[MOVE_EXCESS + 3 * i + j] * column[EXCESS + j]
-                     * move[MOVE_EXCESS_KEEP + j] - move[MOVE_ROTATION + 3 * i + j]
-                     * column[BIAS + j])
+            turn += (move[MOVE_EXCESS + 3 * i + j] * move[MOVE_EXCESS_KEEP + j]
+                     * (column[EXCESS + j] + move[MOVE_SURGE_MEAN] * column[SURGE + j])
+                     - move[MOVE_ROTATION + 3 * i + j] * column[BIAS + j])
             push -= move[MOVE_ROTATION + 3 * i + j] * column[ACC_BIAS + j]
         for j in range(9):
             turn += move[MOVE_SCALE + 9 * i + j] * column[SCALE + j]
@@ -82,7 +85,9 @@ def _moved(move, column, out):
         out[VEL + i] += push
         out[POS + i] += time * column[VEL + i] + 0.5 * time * push
         out[LOCAL + i] *= move[MOVE_LOCAL_KEEP]
+        out[EXCESS + i] += move[MOVE_SURGE_GAIN] * column[SURGE + i]
         out[EXCESS + i] *= move[MOVE_EXCESS_KEEP + i]
+        out[SURGE + i] *= move[MOVE_EXCESS_KEEP + i] * move[MOVE_SURGE_KEEP]
 
 
 @njit(cache=True)
@@ -126,17 +131,21 @@ def move_adjoint(move, adjoint):
         v[i] = adjoint[VEL + i] + 0.5 * time * adjoint[POS + i]
         out[VEL + i] += time * adjoint[POS + i]
         out[LOCAL + i] = adjoint[LOCAL + i] * move[MOVE_LOCAL_KEEP]
-        out[EXCESS + i] = adjoint[EXCESS + i]
     # (-[F]x)' v = [F]x v
     out[ATT] += fy * v[2] - fz * v[1]
     out[ATT + 1] += fz * v[0] - fx * v[2]
     out[ATT + 2] += fx * v[1] - fy * v[0]
     for j in range(3):
+        turn = 0.0
         for i in range(3):
             out[BIAS + j] -= move[MOVE_ROTATION + 3 * i + j] * adjoint[ATT + i]
             out[ACC_BIAS + j] -= move[MOVE_ROTATION + 3 * i + j] * v[i]
-            out[EXCESS + j] += move[MOVE_EXCESS + 3 * i + j] * adjoint[ATT + i]
-        out[EXCESS + j] *= move[MOVE_EXCESS_KEEP + j]
+            turn += move[MOVE_EXCESS + 3 * i + j] * adjoint[ATT + i]
+        keep = move[MOVE_EXCESS_KEEP + j]
+        out[EXCESS + j] = keep * (adjoint[EXCESS + j] + turn)
+        out[SURGE + j] = keep * (move[MOVE_SURGE_KEEP] * adjoint[SURGE + j]
+                                 + move[MOVE_SURGE_GAIN] * adjoint[EXCESS + j]
+                                 + move[MOVE_SURGE_MEAN] * turn)
     for j in range(9):
         for i in range(3):
             out[SCALE + j] += move[MOVE_SCALE + 9 * i + j] * adjoint[ATT + i]

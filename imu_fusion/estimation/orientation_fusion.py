@@ -12,9 +12,10 @@ update corrects it. What is observed:
 - At rest, velocity and rate are zero.
 
 Slow states beside the attitude: gyroscope bias, scale and misalignment, accelerometer
-bias, the magnetometer's offset, matrix and lag. A gyroscope axis at its limit gets a
-state for what it does not show, driven by white angular acceleration, zero
-again when the axis comes back.
+bias, the magnetometer's offset, matrix and lag. A gyroscope axis at its limit gets two
+for what it does not show: the excess of its rate, and the angular acceleration (surge) that
+drives it, which starts as the slope that ran into the limit and is forgotten in
+``surge_time``. The first sample back within the limit tells what the excess has become.
 """
 
 import math
@@ -31,9 +32,10 @@ from imu_fusion.estimation.orientation_fusion_field import (
 from imu_fusion.estimation.orientation_fusion_layout import (
     ACC_LAST, BLOCK_MAGS, BLOCK_START, CLIPPED, COV, GRAVITY, HEADING_VAR, K_SIZE, LIMIT,
     MAG_ROWS, MAG_SUM, MEAN_FORCE, MEAN_RATE, MOTION, MOVE, N, P_ACC_WALK, P_BLOCK,
-    P_ESTIMATE_BIAS, P_EXCESS_WALK, P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD,
-    P_LOCAL_TIME, P_OFFSET_SD, P_POS_SD, P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD,
-    P_SIZE, P_SOFT_SD, P_USE_ACC, P_VEL_SD, P_VEL_TIME, REST_SINCE, S, SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
+    P_ESTIMATE_BIAS, P_FIELD_WALK, P_FOLLOW_FIELD, P_LAG_SD, P_LOCAL_SD, P_LOCAL_TIME,
+    P_OFFSET_SD, P_POS_SD, P_POS_TIME, P_REST_RATE_SD, P_SCALE_SD, P_SIZE, P_SOFT_SD,
+    P_SURGE_SD, P_SURGE_TIME, P_USE_ACC, P_VEL_SD, P_VEL_TIME, REPEATS, REST_SINCE, S, SLOPE,
+    SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
 from imu_fusion.estimation.orientation_state import push_mag
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_normalize, quat_to_matrix)
@@ -46,7 +48,7 @@ _SWAY_TIME = 5.0           # s: velocity changes faster than this show in SWAY
 _MOTION_TIME = 30.0        # s: over which the size of the motion is judged
 _MOTION_SDS2 = 4.0         # squared standard deviations beyond which it is believed at once
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand
-_BACK_SD = 0.1             # rad/s: excess of an axis that has just come back from its limit
+_BACK_SD = 0.1             # rad/s: of what an axis shows that has just come back from its limit
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
 _BURST_SHARE = 0.1         # of the block, while an axis is at its limit
 
@@ -57,7 +59,7 @@ def pack(par, p):
         p.block, p.velocity_walk, p.velocity_sd, p.velocity_time, p.position_sd,
         p.position_time, p.local_field_sd, p.local_field_time, p.field_walk, p.mag_sd,
         p.norm_deviation_factor, p.rest_rate, p.rest_force, p.rest_time, p.rest_rate_sd,
-        p.saturation_walk, p.estimate_bias, p.gyro_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
+        p.surge_sd, p.surge_time, p.estimate_bias, p.gyro_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
         p.mag_delay_sd if p.mag_delay is None else 0.0, p.heading_anchor == "field",
         math.radians(p.heading_sd_deg), p.use_acc)
 
@@ -123,10 +125,54 @@ def _motion_scale(x, par, cov, move):
 
 
 @njit(cache=True)
-def _end_block(x, k, par, still, back, tape):
+def _surge_gain(par, time):
+    """Excess (rad/s) after ``time`` (s) per surge (rad/s^2) before."""
+    return par[P_SURGE_TIME] * (1.0 - math.exp(-time / par[P_SURGE_TIME]))
+
+
+@njit(cache=True)
+def _surge_noise(par, time):
+    """Variances of surge and excess that ``time`` (s) adds (Singer 1970, (5))."""
+    part = time / par[P_SURGE_TIME]
+    keep = math.exp(-part)
+    # The series where the closed form would be a small difference of large numbers.
+    growth = (2.0 / 3.0 * part ** 3 if part < 1e-2
+              else 2.0 * part - 3.0 + 4.0 * keep - keep * keep)
+    return (par[P_SURGE_SD] ** 2 * (1.0 - keep * keep),
+            (par[P_SURGE_SD] * par[P_SURGE_TIME]) ** 2 * growth)
+
+
+@njit(cache=True)
+def _carry_excess(x, k, par, gyr, last, dt, clipped, begun):
+    """What axes at their limit do not show, over one step.
+
+    clipped: bits of the axes at their limit, begun: of those that have just reached it.
+    """
+    noise = x[MOVE + es.MOVE_NOISE:MOVE + es.MOVE_SIZE]
+    for i in range(3):
+        entered = (gyr[i] - last[i]) / dt if dt > 0.0 else 0.0
+        if (begun >> i) & 1:
+            slope = x[SLOPE + i]
+            if (slope - entered) * gyr[i] < 0.0:
+                slope = entered
+            x[S + es.SURGE + i] = slope
+            x[S + es.EXCESS + i] = (slope - entered) * dt
+            # As old as the slope is, or as the limit where it was only now found.
+            age = (1.0 + k[REPEATS + i]) * dt if dt > 0.0 else par[st.P_MAX_GAP]
+            noise[es.SURGE + i], noise[es.EXCESS + i] = _surge_noise(par, age)
+        elif (k[CLIPPED] >> i) & 1:
+            x[S + es.EXCESS + i] += x[S + es.SURGE + i] * _surge_gain(par, dt)
+            x[S + es.SURGE + i] *= math.exp(-dt / par[P_SURGE_TIME])
+        if not (clipped >> i) & 1:
+            x[SLOPE + i] = entered
+
+
+@njit(cache=True)
+def _end_block(x, k, par, still, back, inside, tape):
     """Prediction and updates over the collected block.
 
     still: at rest. back: bits of the axes that came back from their limit.
+    inside: (3,) change of raw rate with which they did, rad/s.
     """
     cov = x[COV:COV + N * N].reshape(N, N)
     move = x[MOVE:MOVE + es.MOVE_SIZE]
@@ -134,18 +180,23 @@ def _end_block(x, k, par, still, back, tape):
     rate = 1e-3 if still else 1.0 / par[P_LOCAL_TIME]
     keep = math.exp(-time * rate)
     move[es.MOVE_LOCAL_KEEP] = keep
+    move[es.MOVE_SURGE_KEEP] = math.exp(-time / par[P_SURGE_TIME])
+    move[es.MOVE_SURGE_GAIN] = _surge_gain(par, time)
+    if time > 0.0:
+        move[es.MOVE_SURGE_MEAN] = par[P_SURGE_TIME] * (1.0 - move[es.MOVE_SURGE_GAIN] / time)
+    surge_var, excess_var = _surge_noise(par, time)
     noise = move[es.MOVE_NOISE:]
     for i in range(3):
-        active = (k[CLIPPED] >> i) & 1
-        move[es.MOVE_EXCESS_KEEP + i] = active & (k[WAS_CLIPPED] >> i)
+        lasting = ((k[CLIPPED] & k[WAS_CLIPPED]) >> i) & 1
+        move[es.MOVE_EXCESS_KEEP + i] = lasting
         noise[es.ATT + i] += par[st.P_GYR_DENSITY] ** 2 * time
         noise[es.BIAS + i] = par[st.P_BIAS_WALK] ** 2 * time
         noise[es.VEL + i] = par[P_ACC_WALK] ** 2 * time
         noise[es.FIELD + i] = par[P_FIELD_WALK] ** 2 * time
         noise[es.LOCAL + i] = par[P_LOCAL_SD] ** 2 * (1.0 - keep * keep)
-        noise[es.EXCESS + i] = active * par[P_EXCESS_WALK] ** 2 * time
-        if active:
-            noise[es.ATT + i] += par[P_EXCESS_WALK] ** 2 * time ** 3 / 3.0
+        if lasting:
+            noise[es.SURGE + i] = surge_var
+            noise[es.EXCESS + i] = excess_var
         x[S + es.LOCAL + i] *= keep
     if len(tape):
         tape[es.TAPE_OPS] = 0
@@ -159,7 +210,8 @@ def _end_block(x, k, par, still, back, tape):
     for i in range(3):
         if (back >> i) & 1:
             index[0] = es.EXCESS + i
-            es.update(cov, error, 1, index, row, -x[S + es.EXCESS + i], _BACK_SD ** 2, tape)
+            es.update(cov, error, 1, index, row, inside[i] - x[S + es.EXCESS + i],
+                      _BACK_SD ** 2, tape)
     # At equal accelerations times grow as velocities do, and extents as their square.
     for i in range(3):
         index[0] = es.VEL + i
@@ -185,6 +237,7 @@ def _end_block(x, k, par, still, back, tape):
         x[st.GYR_BIAS + i] = x[S + es.BIAS + i]
         if (back >> i) & 1:
             x[S + es.EXCESS + i] = 0.0
+            x[S + es.SURGE + i] = 0.0
     # A wrong lag beyond belief would keep every further sample from being used.
     bound = _LAG_SDS * par[P_LAG_SD]
     if bound > 0.0:
@@ -230,16 +283,25 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     if clipped:
         flags |= st.FLAG_SATURATED | clipped << st.SATURATED_AXES_SHIFT
         k[st.SATURATED] += 1
-    k[CLIPPED] |= clipped
-
     missed = np.zeros(3)
     if not first and hold_spike(x, k, gyr, dt, missed):
         flags |= st.FLAG_HELD
         k[st.RATES_HELD] += 1
+        clipped = k[CLIPPED]     # nothing is known of this sample
+    begun = clipped & ~k[CLIPPED]
+    back = k[CLIPPED] & ~clipped
+    k[CLIPPED] |= clipped
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()
     raw = 0.5 * (last + gyr)
-    phi = st.rotation_of_step(_rate(x, last), _rate(x, gyr), dt) + missed
+    inside = gyr - last
+    rate_last = _rate(x, last)
+    _carry_excess(x, k, par, gyr, last, dt, clipped, begun)
+    rate = _rate(x, gyr)
+    for i in range(3):
+        if (back >> i) & 1:
+            rate[i] -= x[S + es.EXCESS + i]
+    phi = st.rotation_of_step(rate_last, rate, dt) + missed
     middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(0.5 * phi)))
     x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], quat_exp(phi)))
     k[st.LAST_STAMP] = stamp
@@ -251,7 +313,8 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
             force += middle[i, j] * f
             move[es.MOVE_ROTATION + 3 * i + j] += middle[i, j] * dt
             if (k[CLIPPED] >> j) & 1:
-                move[es.MOVE_EXCESS + 3 * i + j] += middle[i, j] * dt
+                part = 0.5 if ((begun | back) >> j) & 1 else 1.0
+                move[es.MOVE_EXCESS + 3 * i + j] += part * middle[i, j] * dt
             for c in range(3):
                 move[es.MOVE_SCALE + 9 * i + 3 * j + c] += middle[i, j] * raw[c] * dt
         change = 0.0
@@ -293,11 +356,10 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     still = is_still(x, k, par, stamp, dt, gyr, acc)
     if still:
         flags |= st.FLAG_STILL
-    back = 0 if clipped == k[CLIPPED] or first else k[CLIPPED] & ~clipped
     result = 1
     length = par[P_BLOCK] * (_BURST_SHARE if k[CLIPPED] else 1.0)
     if back or move[es.MOVE_TIME] >= length - 1e-6:
-        _end_block(x, k, par, still, back, tape)
+        _end_block(x, k, par, still, back, inside, tape)
         result = 2
         k[CLIPPED] &= ~back
     if not k[st.HEADING_KNOWN]:
@@ -329,7 +391,8 @@ def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, tak
             var_gyr[i] += cov[slot, slot] * gyr[j] ** 2
         if (k[CLIPPED] >> i) & 1:
             var_gyr[i] += (cov[es.EXCESS + i, es.EXCESS + i]
-                           + par[P_EXCESS_WALK] ** 2 * (since + noise_dt))
+                           + x[MOVE + es.MOVE_NOISE + es.EXCESS + i]
+                           + since ** 2 * cov[es.SURGE + i, es.SURGE + i])
         force[i] = acc[i] - x[S + es.ACC_BIAS + i]
     cov_world[2, 2] += x[HEADING_VAR]
     rate = _rate(x, gyr)

@@ -25,7 +25,8 @@ MOTION = SWAY + 3          # mean square of SWAY over the stated velocity's
 CHANGE = MOTION + 1        # usual change of the rate from sample to sample, rad/s
 HELD_RATE = CHANGE + 1     # (3,) a rate that waits for the next to resemble it
 HELD_STEP = HELD_RATE + 3  # s, the step that it ended
-X_SIZE = HELD_STEP + 1
+SLOPE = HELD_STEP + 1      # (3,) rad/s^2, the last that each axis showed within its limit
+X_SIZE = SLOPE + 3
 
 # Integer state.
 BLOCK_MAGS = st.K_COMMON
@@ -41,6 +42,6 @@ K_SIZE = HELD + 1
 # Parameters.
 (P_BLOCK, P_ACC_WALK, P_VEL_SD, P_VEL_TIME, P_POS_SD, P_POS_TIME, P_LOCAL_SD, P_LOCAL_TIME,
  P_FIELD_WALK, P_MAG_RELATIVE, P_NORM_FACTOR, P_REST_RATE, P_REST_FORCE, P_REST_TIME,
- P_REST_RATE_SD, P_EXCESS_WALK, P_ESTIMATE_BIAS, P_SCALE_SD, P_OFFSET_SD, P_SOFT_SD,
- P_LAG_SD, P_FOLLOW_FIELD, P_HEADING_SD, P_USE_ACC) = range(st.P_COMMON, st.P_COMMON + 24)
-P_SIZE = st.P_COMMON + 24
+ P_REST_RATE_SD, P_SURGE_SD, P_SURGE_TIME, P_ESTIMATE_BIAS, P_SCALE_SD, P_OFFSET_SD, P_SOFT_SD,
+ P_LAG_SD, P_FOLLOW_FIELD, P_HEADING_SD, P_USE_ACC) = range(st.P_COMMON, st.P_COMMON + 25)
+P_SIZE = st.P_COMMON + 25

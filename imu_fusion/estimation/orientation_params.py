@@ -118,8 +118,9 @@ class OrientationParams(Parameters):
     rest_time: float = param(0.5, unit="s", low=0, doc="Time after which rest counts.")
     rest_rate_sd: float = param(0.006, unit="rad/s", low=1e-6,
                                 doc="Rate of a hand or table at rest.")
-    saturation_walk: float = param(25.0, unit="rad/s/sqrt(s)", low=0,
-                                   doc="Random walk of a rate beyond the gyroscope's limit.")
+    surge_sd: float = param(200.0, unit="rad/s^2", low=0,
+                            doc="Angular acceleration of an axis beyond its gyroscope's limit.")
+    surge_time: float = param(0.04, unit="s", low=1e-3, doc="Its correlation time.")
     max_mag_lag: float = param(0.1, unit="s", low=0, high=10,
                                doc="Magnetometer samples that arrive later are dropped.")
     max_gap: float = param(0.1, unit="s", low=1e-3,

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation import orientation_error_state as es
+from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation_state import (
     FLAG_HELD, FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
@@ -312,6 +314,24 @@ def test_adjoint_of_the_prediction():
     move = rng.normal(size=es.MOVE_SIZE)
     a, b = rng.normal(size=(2, es.N))
     assert es.move_error(move, a) @ b == pytest.approx(a @ es.move_adjoint(move, b))
+
+
+def test_surge_against_the_matrix_exponential():
+    """Singer's process over a step, short and long ones, from its differential equation."""
+    par = np.zeros(fusion.P_SIZE)
+    fusion.pack(par, OrientationParams(surge_sd=200.0, surge_time=0.04))
+    rate = 1.0 / 0.04
+    dynamics = np.array([[0.0, 1.0], [0.0, -rate]])        # excess, surge
+    driven = np.diag([0.0, 2.0 * rate * 200.0 ** 2])
+    for time in (1e-5, 3.9e-4, 4.1e-4, 0.002, 0.05, 0.5):
+        # Van Loan (1978): transition and noise are blocks of one exponential.
+        blocks = expm(np.block([[dynamics, driven], [np.zeros((2, 2)), -dynamics.T]]) * time)
+        transition = blocks[:2, :2]
+        noise = blocks[:2, 2:] @ transition.T
+        assert fusion._surge_gain(par, time) == pytest.approx(transition[0, 1], rel=1e-9)
+        # The series leaves out three quarters of a hundredth, at most.
+        assert fusion._surge_noise(par, time) == pytest.approx((noise[1, 1], noise[0, 0]),
+                                                               rel=8e-3)
 
 
 def test_update_and_its_adjoint_against_dense_algebra():

