@@ -10,7 +10,7 @@ from benchmarks.jumps import score
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.estimation.smoother.inputs import even_stamps
+from imu_fusion.estimation.smoother.inputs import even_stamps, spaced
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
@@ -161,6 +161,14 @@ def test_jittered_stamps_of_even_fixes_are_put_back():
     assert np.array_equal(even_stamps(true), true)
     with pytest.raises(SampleError, match="gnss_even_stamps"):
         even_stamps(np.sort(EPOCH + rng.integers(0, 100 * 10**9, 300)))
+
+
+def test_spaced_readings():
+    stamp = EPOCH + np.array([0, 200, 400, 610, 800, 2000, 2001, 2390]) * 1_000_000
+    assert spaced(stamp, 0.0).all()
+    assert np.flatnonzero(spaced(stamp, 0.4)).tolist() == [0, 2, 4, 5]
+    assert np.flatnonzero(spaced(stamp, 10.0)).tolist() == [0]
+    assert not len(spaced(stamp[:0], 1.0))
 
 
 def test_clipped_gyroscope_is_bridged(jump):

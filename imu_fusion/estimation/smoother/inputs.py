@@ -179,6 +179,27 @@ def even_stamps(stamp):
     return stamp[0] + np.round(even * 1e9).astype(np.int64)
 
 
+def spaced(stamp, interval):
+    """Mask (m,) of readings that follow the last one taken by at least ``interval`` s.
+
+    stamp: (m,) ns, ascending. The first reading is taken.
+    """
+    step = round(interval * 1e9)
+    keep = np.zeros(len(stamp), bool)
+    i = 0
+    while i < len(stamp):
+        keep[i] = True
+        i = max(i + 1, int(np.searchsorted(stamp, stamp[i] + step)))
+    return keep
+
+
+def _gnss_readings(log, params):
+    """Readings (FixLog or VelocityLog) to use, and their stamps (m,) ns."""
+    stamp = even_stamps(log.stamp) if params.gnss_even_stamps else log.stamp
+    keep = spaced(stamp, params.gnss_min_interval)
+    return log[keep], stamp[keep]
+
+
 def prepare_measurements(frame, mag, fix, velocity, params):
     """All readings as :class:`Measurements`; those that are not finite are left out.
 
@@ -193,20 +214,20 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
                               "alone is the job of the orientation estimator")
     eye = np.eye(3)
+    fix, stamp = _gnss_readings(fix, params)
     root = _covariances(fix.cov_enu, params.fix_sd, "the fixes")
-    parts.append((fix.stamp, FIX, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
+    parts.append((stamp, FIX, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
                   root, params.fix_loss_scale))
     if velocity is not None:
-        velocity = velocity[np.isfinite(velocity.vel_world).all(axis=1)]
+        velocity, stamp = _gnss_readings(
+            velocity[np.isfinite(velocity.vel_world).all(axis=1)], params)
         root = _covariances(velocity.cov_world, params.velocity_sd, "the velocities")
-        parts.append((velocity.stamp, VELOCITY, velocity.vel_world, root, params.fix_loss_scale))
+        parts.append((stamp, VELOCITY, velocity.vel_world, root, params.fix_loss_scale))
     if mag is not None:
         mag = mag[np.isfinite(mag.mag).all(axis=1)]
         root = np.broadcast_to(params.mag_sd * _MICRO * eye, (len(mag), 3, 3))
         parts.append((mag.stamp, MAG, mag.mag * _MICRO, root, params.mag_loss_scale))
     whiten = np.concatenate([np.linalg.inv(p[3]) for p in parts])
-    if params.gnss_even_stamps:
-        parts = [(p[0] if p[1] == MAG else even_stamps(p[0]), *p[1:]) for p in parts]
     return Measurements(
         stamp=np.concatenate([p[0] for p in parts]),
         kind=np.concatenate([np.full(len(p[0]), p[1]) for p in parts]),

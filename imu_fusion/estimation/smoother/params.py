@@ -56,6 +56,9 @@ class SmootherParams(Parameters):
     gnss_velocity_error_tau: float = param(1.0, doc="Its correlation time", unit="s", low=0.01)
     gnss_even_stamps: bool = param(False, doc="Fixes are taken at an even rate and their stamps, "
                                    "times of arrival, jitter: put them back on a straight line")
+    gnss_min_interval: float = param(0.0, doc="Fixes and velocities that follow the last one used "
+                                     "by less are left out: the filter of a receiver makes "
+                                     "neighbours repeat each other's errors", unit="s", low=0.0)
     gnss_time_offset_sd: float = param(0.0, doc="Delay of the GNSS stamps as a state", unit="s",
                                        low=0.0, high=2.0)
     velocity_time_offset_sd: float = param(0.0, doc="Further delay of velocities alone as a state; "

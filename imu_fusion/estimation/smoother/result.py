@@ -18,7 +18,8 @@ _CAUSES = {
     "fix": "the covariances of the messages may be too small (else fix_sd), the stamps late "
            "(gnss_time_offset_sd: 0.2 finds it) or the errors wander (gnss_position_error_sd)",
     "velocity": "the covariances of the messages may be too small (else velocity_sd), the stamps "
-                "late (velocity_time_offset_sd: 0.2 finds it) or filtered (gnss_velocity_error_sd)",
+                "late (velocity_time_offset_sd: 0.2 finds it) or filtered (gnss_velocity_error_sd, "
+                "gnss_min_interval)",
     "mag": "the field may be disturbed, or mag_sd, mag_bias_sd and mag_scale_sd too small"}
 
 
