@@ -35,7 +35,8 @@ MOVE_EXCESS_KEEP = 50  # (3,) 1 where the axis was at its limit before, else 0
 MOVE_SURGE_KEEP = 53   # factor that SURGE keeps
 MOVE_SURGE_GAIN = 54   # s, of EXCESS per SURGE at the block's end
 MOVE_SURGE_MEAN = 55   # s, the same on average over the block
-MOVE_NOISE = 56        # (N,) diagonal of the process noise
+MOVE_STATES = 56       # EXCESS if no axis is at its limit, else N: what comes later is zero
+MOVE_NOISE = 57        # (N,) diagonal of the process noise
 MOVE_SIZE = MOVE_NOISE + N
 
 # One scalar update on the tape: count, indices, coefficients, gain, variance, residual.
@@ -57,109 +58,170 @@ TAPE_OP = TAPE_COV + N * N
 TAPE_SIZE = TAPE_OP + MAX_OPS * OP_SIZE
 
 
+# States whose rows Phi, and Phi', change; those of axes at their limit come last.
+_MOVED = np.array([0, 1, 2, 15, 16, 17, 18, 19, 20, 24, 25, 26, 43, 44, 45, 46, 47, 48])
+_MOVED_BACK = np.array([*range(0, 18), 24, 25, 26, 30, 31, 32, 43, 44, 45, 46, 47, 48])
+_LIMIT_STATES = N - EXCESS
+
+
 @njit(cache=True)
-def _moved(move, column, out):
-    """out = Phi column, both (N,)."""
+def _add(out, factor, row, width):
+    for c in range(width):
+        out[c] += factor * row[c]
+
+
+@njit(cache=True)
+def _moved(move, p, width, out):
+    """Rows _MOVED of Phi p. p (N, width or more); out (len(_MOVED), width or more)."""
     time = move[MOVE_TIME]
-    fx, fy, fz = move[MOVE_FORCE], move[MOVE_FORCE + 1], move[MOVE_FORCE + 2]
-    a0, a1, a2 = column[ATT], column[ATT + 1], column[ATT + 2]
-    for i in range(N):
-        out[i] = column[i]
+    for i in range(len(_MOVED)):
+        for c in range(width):
+            out[i, c] = p[_MOVED[i], c]
+    at_limit = move[MOVE_STATES] > EXCESS
     for i in range(3):
-        turn = 0.0
-        push = 0.0
+        turn, speed, place = out[i], out[3 + i], out[6 + i]
+        push = np.zeros(width)
         for j in range(3):
-            turn += (move[MOVE_EXCESS + 3 * i + j] * move[MOVE_EXCESS_KEEP + j]
-                     * (column[EXCESS + j] + move[MOVE_SURGE_MEAN] * column[SURGE + j])
-                     - move[MOVE_ROTATION + 3 * i + j] * column[BIAS + j])
-            push -= move[MOVE_ROTATION + 3 * i + j] * column[ACC_BIAS + j]
+            r = move[MOVE_ROTATION + 3 * i + j]
+            _add(turn, -r, p[BIAS + j], width)
+            _add(push, -r, p[ACC_BIAS + j], width)
+            if at_limit:
+                r = move[MOVE_EXCESS + 3 * i + j] * move[MOVE_EXCESS_KEEP + j]
+                _add(turn, r, p[EXCESS + j], width)
+                _add(turn, r * move[MOVE_SURGE_MEAN], p[SURGE + j], width)
         for j in range(9):
-            turn += move[MOVE_SCALE + 9 * i + j] * column[SCALE + j]
-        if i == 0:
-            push -= fy * a2 - fz * a1
-        elif i == 1:
-            push -= fz * a0 - fx * a2
-        else:
-            push -= fx * a1 - fy * a0
-        out[ATT + i] += turn
-        out[VEL + i] += push
-        out[POS + i] += time * column[VEL + i] + 0.5 * time * push
-        out[LOCAL + i] *= move[MOVE_LOCAL_KEEP]
-        out[EXCESS + i] += move[MOVE_SURGE_GAIN] * column[SURGE + i]
-        out[EXCESS + i] *= move[MOVE_EXCESS_KEEP + i]
-        out[SURGE + i] *= move[MOVE_EXCESS_KEEP + i] * move[MOVE_SURGE_KEEP]
+            _add(turn, move[MOVE_SCALE + 9 * i + j], p[SCALE + j], width)
+        # -[F]x p
+        after, before = (i + 1) % 3, (i + 2) % 3
+        _add(push, -move[MOVE_FORCE + after], p[ATT + before], width)
+        _add(push, move[MOVE_FORCE + before], p[ATT + after], width)
+        _add(place, time, p[VEL + i], width)
+        _add(place, 0.5 * time, push, width)
+        _add(speed, 1.0, push, width)
+        keep = move[MOVE_EXCESS_KEEP + i]
+        for c in range(width):
+            out[9 + i, c] *= move[MOVE_LOCAL_KEEP]
+            out[12 + i, c] = keep * (out[12 + i, c] + move[MOVE_SURGE_GAIN] * p[SURGE + i, c])
+            out[15 + i, c] *= keep * move[MOVE_SURGE_KEEP]
+
+
+@njit(cache=True)
+def _moved_back(move, p, width, out):
+    """Rows _MOVED_BACK of Phi' p. p (N, width or more); out (len(_MOVED_BACK), width or more)."""
+    time = move[MOVE_TIME]
+    for i in range(len(_MOVED_BACK)):
+        for c in range(width):
+            out[i, c] = p[_MOVED_BACK[i], c]
+    push = np.empty((3, width))
+    for i in range(3):
+        for c in range(width):
+            push[i, c] = p[VEL + i, c] + 0.5 * time * p[POS + i, c]
+        _add(out[15 + i], time, p[POS + i], width)
+    for j in range(3):
+        # (-[F]x)' p = [F]x p
+        after, before = (j + 1) % 3, (j + 2) % 3
+        _add(out[j], move[MOVE_FORCE + after], push[before], width)
+        _add(out[j], -move[MOVE_FORCE + before], push[after], width)
+        turn = np.zeros(width)
+        for i in range(3):
+            r = move[MOVE_ROTATION + 3 * i + j]
+            _add(out[3 + j], -r, p[ATT + i], width)
+            _add(out[21 + j], -r, push[i], width)
+            _add(turn, move[MOVE_EXCESS + 3 * i + j], p[ATT + i], width)
+        keep = move[MOVE_EXCESS_KEEP + j]
+        for c in range(width):
+            out[18 + j, c] *= move[MOVE_LOCAL_KEEP]
+            out[27 + j, c] = keep * (move[MOVE_SURGE_KEEP] * p[SURGE + j, c]
+                                     + move[MOVE_SURGE_GAIN] * p[EXCESS + j, c]
+                                     + move[MOVE_SURGE_MEAN] * turn[c])
+            out[24 + j, c] = keep * (p[EXCESS + j, c] + turn[c])
+    for j in range(9):
+        for i in range(3):
+            _add(out[6 + j], move[MOVE_SCALE + 9 * i + j], p[ATT + i], width)
+
+
+@njit(cache=True)
+def _put(matrix, rows, corner, which, states):
+    """Rows ``which`` of a congruence F p F' into the symmetric p, in place.
+
+    rows: those of F p. corner: those of F (F p)' at the columns ``which``.
+    """
+    count = len(which)
+    if states < N:
+        count -= _LIMIT_STATES
+        matrix[states:] = 0.0
+        matrix[:, states:] = 0.0
+    for a in range(count):
+        i = which[a]
+        for j in range(states):
+            matrix[i, j] = rows[a, j]
+            matrix[j, i] = rows[a, j]
+    for a in range(count):
+        for b in range(a + 1):
+            mean = 0.5 * (corner[a, b] + corner[b, a])
+            matrix[which[a], which[b]] = mean
+            matrix[which[b], which[a]] = mean
 
 
 @njit(cache=True)
 def predict(cov, move):
     """cov = Phi cov Phi' + noise, in place. cov (N, N) symmetric."""
-    out = np.empty(N)
-    for j in range(N):
-        _moved(move, cov[j], out)      # rows: cov is symmetric
-        cov[j] = out
-    column = np.empty(N)
-    for j in range(N):
-        for i in range(N):
-            column[i] = cov[i, j]
-        _moved(move, column, out)
-        for i in range(N):
-            cov[i, j] = out[i]
-    for i in range(N):
+    states = int(move[MOVE_STATES])
+    count = len(_MOVED)
+    rows = np.empty((count, N))
+    corner = np.empty((count, count))
+    _moved(move, cov, states, rows)
+    _moved(move, np.ascontiguousarray(rows.T), count, corner)
+    _put(cov, rows, corner, _MOVED, states)
+    for i in range(states):
         cov[i, i] += move[MOVE_NOISE + i]
-        for j in range(i):
-            mean = 0.5 * (cov[i, j] + cov[j, i])
-            cov[i, j] = mean
-            cov[j, i] = mean
+
+
+@njit(cache=True)
+def predict_information(information, move):
+    """information = Phi' information Phi, in place. information (N, N) symmetric."""
+    states = int(move[MOVE_STATES])
+    count = len(_MOVED_BACK)
+    rows = np.empty((count, N))
+    corner = np.empty((count, count))
+    _moved_back(move, information, states, rows)
+    _moved_back(move, np.ascontiguousarray(rows.T), count, corner)
+    _put(information, rows, corner, _MOVED_BACK, states)
 
 
 @njit(cache=True)
 def move_error(move, error):
     """Phi error, without noise. error (N,). Returns (N,)."""
-    out = np.empty(N)
-    _moved(move, error, out)
+    states = int(move[MOVE_STATES])
+    rows = np.empty((len(_MOVED), 1))
+    _moved(move, error.copy().reshape(N, 1), 1, rows)
+    out = error.copy()
+    out[_MOVED] = rows[:, 0]
+    out[states:] = 0.0
     return out
 
 
 @njit(cache=True)
 def move_adjoint(move, adjoint):
     """Phi' adjoint. adjoint (N,). Returns (N,)."""
-    time = move[MOVE_TIME]
-    fx, fy, fz = move[MOVE_FORCE], move[MOVE_FORCE + 1], move[MOVE_FORCE + 2]
+    states = int(move[MOVE_STATES])
+    rows = np.empty((len(_MOVED_BACK), 1))
+    _moved_back(move, adjoint.copy().reshape(N, 1), 1, rows)
     out = adjoint.copy()
-    v = np.empty(3)
-    for i in range(3):
-        v[i] = adjoint[VEL + i] + 0.5 * time * adjoint[POS + i]
-        out[VEL + i] += time * adjoint[POS + i]
-        out[LOCAL + i] = adjoint[LOCAL + i] * move[MOVE_LOCAL_KEEP]
-    # (-[F]x)' v = [F]x v
-    out[ATT] += fy * v[2] - fz * v[1]
-    out[ATT + 1] += fz * v[0] - fx * v[2]
-    out[ATT + 2] += fx * v[1] - fy * v[0]
-    for j in range(3):
-        turn = 0.0
-        for i in range(3):
-            out[BIAS + j] -= move[MOVE_ROTATION + 3 * i + j] * adjoint[ATT + i]
-            out[ACC_BIAS + j] -= move[MOVE_ROTATION + 3 * i + j] * v[i]
-            turn += move[MOVE_EXCESS + 3 * i + j] * adjoint[ATT + i]
-        keep = move[MOVE_EXCESS_KEEP + j]
-        out[EXCESS + j] = keep * (adjoint[EXCESS + j] + turn)
-        out[SURGE + j] = keep * (move[MOVE_SURGE_KEEP] * adjoint[SURGE + j]
-                                 + move[MOVE_SURGE_GAIN] * adjoint[EXCESS + j]
-                                 + move[MOVE_SURGE_MEAN] * turn)
-    for j in range(9):
-        for i in range(3):
-            out[SCALE + j] += move[MOVE_SCALE + 9 * i + j] * adjoint[ATT + i]
+    out[_MOVED_BACK] = rows[:, 0]
+    out[states:] = 0.0
     return out
 
 
 @njit(cache=True)
-def update(cov, error, count, index, coefficient, residual, variance, tape):
+def update(cov, error, states, count, index, coefficient, residual, variance, tape):
     """One scalar measurement of the error state, in place.
 
     residual = sum_a coefficient[a] error[index[a]] + noise of ``variance``.
 
     Args:
         cov: (N, N). error: (N,) mean of the error so far.
+        states: how many of them there are; the others are zero.
         count, index, coefficient: the measurement's row, sparse.
         tape: a block's tape, or an empty array.
     """
@@ -168,7 +230,7 @@ def update(cov, error, count, index, coefficient, residual, variance, tape):
         c = coefficient[a]
         if c != 0.0:
             row = cov[index[a]]
-            for i in range(N):
+            for i in range(states):
                 spread[i] += c * row[i]
     total = variance
     innovation = residual
@@ -186,34 +248,34 @@ def update(cov, error, count, index, coefficient, residual, variance, tape):
         op[OP_VARIANCE] = total
         op[OP_RESIDUAL] = innovation
         tape[TAPE_OPS] += 1
-    for i in range(N):
+    for i in range(states):
         gain = spread[i] / total
         error[i] += gain * innovation
         if gain != 0.0:
-            for j in range(N):
+            for j in range(states):
                 cov[i, j] -= gain * spread[j]
 
 
 @njit(cache=True)
-def unupdate(op, adjoint, information):
+def unupdate(op, adjoint, information, states):
     """Carry the smoother's adjoint (N,) and information (N, N) back over one update.
 
     Modified Bryson-Frazier: with A = I - K h, ``l = A' l + h r / s`` and
-    ``L = A' L A + h h' / s``.
+    ``L = A' L A + h h' / s``. states: as for :func:`update`.
     """
     count = int(op[0])
     gain = op[OP_GAIN:OP_GAIN + N]
     total = op[OP_VARIANCE]
     along = 0.0
     pulled = np.zeros(N)
-    for i in range(N):
+    for i in range(states):
         along += gain[i] * adjoint[i]
         g = gain[i]
         if g != 0.0:
-            for j in range(N):
+            for j in range(states):
                 pulled[j] += g * information[i, j]
     both = 0.0
-    for i in range(N):
+    for i in range(states):
         both += pulled[i] * gain[i]
     for a in range(count):
         row = int(op[OP_INDEX + a])
@@ -221,7 +283,7 @@ def unupdate(op, adjoint, information):
         if c == 0.0:
             continue
         adjoint[row] += c * (op[OP_RESIDUAL] / total - along)
-        for j in range(N):
+        for j in range(states):
             information[row, j] -= c * pulled[j]
             information[j, row] -= c * pulled[j]
     for a in range(count):

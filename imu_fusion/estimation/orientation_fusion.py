@@ -185,6 +185,8 @@ def _end_block(x, k, par, still, back, inside, tape):
     if time > 0.0:
         move[es.MOVE_SURGE_MEAN] = par[P_SURGE_TIME] * (1.0 - move[es.MOVE_SURGE_GAIN] / time)
     surge_var, excess_var = _surge_noise(par, time)
+    states = N if k[CLIPPED] else es.EXCESS
+    move[es.MOVE_STATES] = states
     noise = move[es.MOVE_NOISE:]
     for i in range(3):
         lasting = ((k[CLIPPED] & k[WAS_CLIPPED]) >> i) & 1
@@ -210,27 +212,29 @@ def _end_block(x, k, par, still, back, inside, tape):
     for i in range(3):
         if (back >> i) & 1:
             index[0] = es.EXCESS + i
-            es.update(cov, error, 1, index, row, inside[i] - x[S + es.EXCESS + i],
+            es.update(cov, error, states, 1, index, row, inside[i] - x[S + es.EXCESS + i],
                       _BACK_SD ** 2, tape)
-    # At equal accelerations times grow as velocities do, and extents as their square.
     for i in range(3):
+        if still:
+            index[0] = es.BIAS + i
+            es.update(cov, error, states, 1, index, row, mean_rate(x, i) - x[S + es.BIAS + i],
+                      par[P_REST_RATE_SD] ** 2 * REST_MEMORY / time, tape)
+        if not par[P_USE_ACC]:
+            continue    # without force, velocity and position tell nothing
+        # At equal accelerations times grow as velocities do, and extents as their square.
         index[0] = es.VEL + i
         variance = (_REST_SPEED_SD ** 2 * 0.02 / time if still
                     else scale ** 3 * par[P_VEL_SD] ** 2 * max(par[P_VEL_TIME] / time, 1.0))
-        es.update(cov, error, 1, index, row, -x[S + es.VEL + i], variance, tape)
-        if still:
-            index[0] = es.BIAS + i
-            es.update(cov, error, 1, index, row, mean_rate(x, i) - x[S + es.BIAS + i],
-                      par[P_REST_RATE_SD] ** 2 * REST_MEMORY / time, tape)
+        es.update(cov, error, states, 1, index, row, -x[S + es.VEL + i], variance, tape)
         index[0] = es.POS + i
-        es.update(cov, error, 1, index, row, -x[S + es.POS + i],
+        es.update(cov, error, states, 1, index, row, -x[S + es.POS + i],
                   scale ** 5 * par[P_POS_SD] ** 2 * max(par[P_POS_TIME] / time, 1.0), tape)
     if k[BLOCK_MAGS] > 0:
         update_mag(x, k, par, error, still, tape)
 
     x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(quat_exp(error[:3].copy()),
                                                     x[st.Q:st.Q + 4]))
-    for i in range(3, N):
+    for i in range(3, states):
         if par[P_ESTIMATE_BIAS] or i < es.BIAS or i >= es.VEL:
             x[S + i] += error[i]
     for i in range(3):
@@ -303,9 +307,10 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
             rate[i] -= x[S + es.EXCESS + i]
     phi = st.rotation_of_step(rate_last, rate, dt) + missed
     middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(0.5 * phi)))
-    x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], quat_exp(phi)))
+    turn = quat_exp(phi)
+    x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], turn))
     k[st.LAST_STAMP] = stamp
-    st.push_rotation(x, k, stamp, phi)
+    st.push_rotation(x, k, stamp, turn)
     for i in range(3):
         force = 0.0
         for j in range(3):
@@ -339,7 +344,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
             x[S + es.VEL + i] = 0.0
             x[S + es.POS + i] = 0.0
 
-    samples = np.empty((st.PENDING_LENGTH, st.TAKEN_WORDS))
+    samples = np.empty((k[st.PENDING_COUNT], st.TAKEN_WORDS))
     taken = st.take_mags(x, k, samples)
     reliability = np.nan
     mag = np.full(3, np.nan)

@@ -56,13 +56,13 @@ def start_field(x, k, par, z, has_heading, follow):
             row[5 + c] = r[i, c] * follow
             for d in range(3):
                 row[8 + 3 * c + d] = r[i, c] * m[d] * follow
-        es.update(cov, error, _MAG_STATES, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+        es.update(cov, error, N, _MAG_STATES, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
     if has_heading and follow:
         for c in range(2):
             index[c], index[2 + c] = es.FIELD + c, es.LOCAL + c
         row[0] = row[2] = math.cos(par[st.P_DECLINATION])
         row[1] = row[3] = -math.sin(par[st.P_DECLINATION])
-        es.update(cov, error, 4, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+        es.update(cov, error, N, 4, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
 
 
 @njit(cache=True)
@@ -157,6 +157,7 @@ def update_mag(x, k, par, error, still, tape):
     expected = x[S + es.FIELD:S + es.FIELD + 3] + x[S + es.LOCAL:S + es.LOCAL + 3]
     deviation = abs(math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2) - 1.0)
     time = x[MOVE + es.MOVE_TIME]
+    states = int(x[MOVE + es.MOVE_STATES])
     sd = par[P_MAG_RELATIVE] + par[P_NORM_FACTOR] * deviation
     # White over 20 ms: faster sampling of the same disturbance is no news.
     variance = sd * sd * max(0.02 / time, 1.0 / count) + (par[st.P_MAG_SD] / x[NORM]) ** 2 / count
@@ -173,7 +174,7 @@ def update_mag(x, k, par, error, still, tape):
         distance += _distance(cov, error, index[i], row[i], z[i] - expected[i], variance)
     variance *= (_TAIL_DOF + distance) / (_TAIL_DOF + 3.0)
     for i in range(3):
-        es.update(cov, error, _MAG_STATES, index[i], row[i], z[i] - expected[i], variance, tape)
+        es.update(cov, error, states, _MAG_STATES, index[i], row[i], z[i] - expected[i], variance, tape)
 
 
 @njit(cache=True)

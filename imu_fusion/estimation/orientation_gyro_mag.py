@@ -26,7 +26,7 @@ from imu_fusion.estimation.orientation_state import (
     ALIGN_UNTIL, FIELD, FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING,
     FLAG_SATURATED, SATURATED_AXES_SHIFT, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, LAST_STAMP, MAG_USED,
     P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_GAP_RATE_SD, P_GYR_DENSITY,
-    P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_LENGTH, Q, SATURATED, STARTED,
+    P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_COUNT, Q, SATURATED, STARTED,
     TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
     take_mags, write_row)
 from imu_fusion.geometry.rotation import (
@@ -235,7 +235,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
     if k[STARTED]:
         dt = (stamp - k[LAST_STAMP]) * 1e-9
         rate = x[GYR_LAST:GYR_LAST + 3] - bias
-    push_rotation(x, k, stamp, 0.5 * dt * (rate + rate_next))
+    push_rotation(x, k, stamp, quat_exp(0.5 * dt * (rate + rate_next)))
     k[LAST_STAMP] = stamp
     k[STARTED] = 1
     x[GYR_LAST:GYR_LAST + 3] = gyr
@@ -251,7 +251,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
         k[SATURATED] += 1
 
     # The step: gyroscope alone, or with the magnetometer samples that came.
-    samples = np.empty((PENDING_LENGTH, TAKEN_WORDS))
+    samples = np.empty((k[PENDING_COUNT], TAKEN_WORDS))
     taken = take_mags(x, k, samples)
     b0 = math.sqrt(x[FIELD] ** 2 + x[FIELD + 1] ** 2 + x[FIELD + 2] ** 2)
     weight = 0.0

@@ -90,25 +90,23 @@ def _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, en
         # Behind the last block of the recording: already the best there is.
         st.beyond_limits(rows[row, st.ROW_GYR:st.ROW_GYR + 3], _clipped(rows_int[row]), limits)
         row -= 1
+    last = cov0 if blocks == 0 else tapes[blocks - 1, es.TAPE_COV:es.TAPE_COV + N * N]
+    after = last.reshape(N, N) @ adjoint
+    cov_after = _smoothed_cov(last.reshape(N, N), information)
     for b in range(blocks - 1, -1, -1):
         tape = tapes[b]
+        states = int(tape[es.TAPE_MOVE + es.MOVE_STATES])
         move = tape[es.TAPE_MOVE:es.TAPE_MOVE + es.MOVE_SIZE]
-        cov = tape[es.TAPE_COV:es.TAPE_COV + N * N].reshape(N, N)
-        after = cov @ adjoint
-        cov_after = _smoothed_cov(cov, information)
         for op in range(int(tape[es.TAPE_OPS]) - 1, -1, -1):
             start = es.TAPE_OP + op * es.OP_SIZE
-            es.unupdate(tape[start:start + es.OP_SIZE], adjoint, information)
+            es.unupdate(tape[start:start + es.OP_SIZE], adjoint, information, states)
         pushed = adjoint * move[es.MOVE_NOISE:es.MOVE_NOISE + N]
         if tape[es.TAPE_TURNED]:
             adjoint[:] = 0.0
             information[:] = 0.0
         else:
             adjoint[:] = es.move_adjoint(move, adjoint)
-            for c in range(N):
-                information[c] = es.move_adjoint(move, information[c])
-            for c in range(N):
-                information[:, c] = es.move_adjoint(move, information[:, c].copy())
+            es.predict_information(information, move)
         before_cov = cov0.reshape(N, N)
         before_stamp = stamp0
         if b > 0:
@@ -128,6 +126,7 @@ def _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, en
             _correct_row(rows[row], par, error, cov_row, heading_var, _clipped(rows_int[row]),
                          limits)
             row -= 1
+        after, cov_after = before, cov_before
 
 
 @njit(cache=True)

@@ -150,9 +150,9 @@ def rotation_of_step(rate, rate_next, dt):
 
 
 @njit(cache=True)
-def push_rotation(x, k, stamp, phi):
-    """Turn the gyroscope chain by phi (rad, imu axes) and remember it at ``stamp``."""
-    u = quat_normalize(quat_multiply(x[U:U + 4], quat_exp(phi)))
+def push_rotation(x, k, stamp, turn):
+    """Turn the gyroscope chain by a quaternion (4,), imu axes, and remember it at ``stamp``."""
+    u = quat_normalize(quat_multiply(x[U:U + 4], turn))
     x[U:U + 4] = u
     slot = k[HISTORY_COUNT] % HISTORY_LENGTH
     x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4] = u
@@ -234,7 +234,7 @@ def push_mag(x, k, par, stamp, mag):
 def take_mags(x, k, taken):
     """The waiting samples that the newest Imu sample has passed.
 
-    Writes one row of ``taken`` (PENDING_LENGTH, TAKEN_WORDS) for each: field in imu axes
+    Writes one row of ``taken`` (k[PENDING_COUNT], TAKEN_WORDS) for each: field in imu axes
     at its own time (3), rate of turn then (3), rotation from there to the newest Imu
     sample (4). Returns how many.
     """
@@ -304,12 +304,14 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
     row_int[ROW_STAMP] = stamp
     row[ROW_QUAT:ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
     r = quat_to_matrix(ahead)
+    half = np.empty((3, 3))
+    for m in range(3):
+        for j in range(3):
+            half[m, j] = (cov_world[m, 0] * r[0, j] + cov_world[m, 1] * r[1, j]
+                          + cov_world[m, 2] * r[2, j])
     for i in range(3):
         for j in range(3):
-            total = 0.0
-            for m in range(3):
-                for n in range(3):
-                    total += r[m, i] * cov_world[m, n] * r[n, j]
+            total = r[0, i] * half[0, j] + r[1, i] * half[1, j] + r[2, i] * half[2, j]
             row[ROW_COV + 3 * i + j] = total + unseen_cov(par, gyr, i, j)
             row[ROW_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
             row[ROW_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
