@@ -37,8 +37,8 @@ from imu_fusion.estimation.orientation_fusion_layout import (
     P_SURGE_SD, P_SURGE_TIME, P_USE_ACC, P_VEL_SD, P_VEL_TIME, REPEATS, REST_SINCE, S, SLOPE,
     SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
 from imu_fusion.estimation.orientation_state import push_mag
-from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_to_matrix)
+from imu_fusion.geometry import quaternion
+from imu_fusion.geometry.rotation import quat_to_matrix
 
 # What every kernel offers beside its functions.
 __all__ = ["K_SIZE", "P_SIZE", "X_SIZE", "advance", "initialise", "pack", "push_mag", "run_loop",
@@ -92,13 +92,14 @@ def initialise(x, k, par, a):
 
 @njit(cache=True)
 def _rate(x, gyr):
-    """Rate of turn (3,) from a raw one, with bias, scale and excess."""
-    rate = np.empty(3)
-    for i in range(3):
-        rate[i] = gyr[i] - x[S + es.BIAS + i] + x[S + es.EXCESS + i]
-        for j in range(3):
-            rate[i] += x[S + es.SCALE + 3 * i + j] * gyr[j]
-    return rate
+    """Rate of turn, a tuple, from a raw one, with bias, scale and excess."""
+    bias, excess, scale = S + es.BIAS, S + es.EXCESS, S + es.SCALE
+    return (gyr[0] - x[bias] + x[excess] + x[scale] * gyr[0] + x[scale + 1] * gyr[1]
+            + x[scale + 2] * gyr[2],
+            gyr[1] - x[bias + 1] + x[excess + 1] + x[scale + 3] * gyr[0] + x[scale + 4] * gyr[1]
+            + x[scale + 5] * gyr[2],
+            gyr[2] - x[bias + 2] + x[excess + 2] + x[scale + 6] * gyr[0] + x[scale + 7] * gyr[1]
+            + x[scale + 8] * gyr[2])
 
 
 @njit(cache=True)
@@ -168,11 +169,11 @@ def _carry_excess(x, k, par, gyr, last, dt, clipped, begun):
 
 
 @njit(cache=True)
-def _end_block(x, k, par, still, back, inside, tape):
+def _end_block(x, k, par, still, back, gyr, last, tape):
     """Prediction and updates over the collected block.
 
     still: at rest. back: bits of the axes that came back from their limit.
-    inside: (3,) change of raw rate with which they did, rad/s.
+    gyr, last: (3,) raw rates of the newest sample and the one before, rad/s.
     """
     cov = x[COV:COV + N * N].reshape(N, N)
     move = x[MOVE:MOVE + es.MOVE_SIZE]
@@ -212,8 +213,8 @@ def _end_block(x, k, par, still, back, inside, tape):
     for i in range(3):
         if (back >> i) & 1:
             index[0] = es.EXCESS + i
-            es.update(cov, error, states, 1, index, row, inside[i] - x[S + es.EXCESS + i],
-                      _BACK_SD ** 2, tape)
+            es.update(cov, error, states, 1, index, row, gyr[i] - last[i]
+                      - x[S + es.EXCESS + i], _BACK_SD ** 2, tape)
     for i in range(3):
         if still:
             index[0] = es.BIAS + i
@@ -232,8 +233,8 @@ def _end_block(x, k, par, still, back, inside, tape):
     if k[BLOCK_MAGS] > 0:
         update_mag(x, k, par, error, still, tape)
 
-    x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(quat_exp(error[:3].copy()),
-                                                    x[st.Q:st.Q + 4]))
+    x[st.Q:st.Q + 4] = quaternion.normalize(quaternion.multiply(quaternion.exp(error, 1.0),
+                                                                x[st.Q:st.Q + 4]))
     for i in range(3, states):
         if par[P_ESTIMATE_BIAS] or i < es.BIAS or i >= es.VEL:
             x[S + i] += error[i]
@@ -270,7 +271,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     if not st.is_newer(k, stamp, sample):
         return 0
     gyr = sample[:3].copy()
-    acc = sample[3:6].copy()
+    acc = sample[3:6]
     first = not k[st.STARTED]
     if first:
         x[st.GYR_LAST:st.GYR_LAST + 3] = gyr
@@ -297,18 +298,18 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     k[CLIPPED] |= clipped
     # Trapezoidal rates and forces over the step, at the attitude of its middle.
     last = x[st.GYR_LAST:st.GYR_LAST + 3].copy()
-    raw = 0.5 * (last + gyr)
-    inside = gyr - last
     rate_last = _rate(x, last)
     _carry_excess(x, k, par, gyr, last, dt, clipped, begun)
     rate = _rate(x, gyr)
-    for i in range(3):
-        if (back >> i) & 1:
-            rate[i] -= x[S + es.EXCESS + i]
-    phi = st.rotation_of_step(rate_last, rate, dt) + missed
-    middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(0.5 * phi)))
-    turn = quat_exp(phi)
-    x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], turn))
+    if back:    # those axes show their rates again
+        excess = S + es.EXCESS
+        rate = (rate[0] - (back & 1) * x[excess], rate[1] - (back >> 1 & 1) * x[excess + 1],
+                rate[2] - (back >> 2) * x[excess + 2])
+    phi = st.rotation_of_step(rate_last, rate, dt)
+    phi = (phi[0] + missed[0], phi[1] + missed[1], phi[2] + missed[2])
+    middle = quat_to_matrix(quaternion.multiply(x[st.Q:st.Q + 4], quaternion.exp(phi, 0.5)))
+    turn = quaternion.exp(phi, 1.0)
+    x[st.Q:st.Q + 4] = quaternion.normalize(quaternion.multiply(x[st.Q:st.Q + 4], turn))
     k[st.LAST_STAMP] = stamp
     st.push_rotation(x, k, stamp, turn)
     for i in range(3):
@@ -321,7 +322,8 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
                 part = 0.5 if ((begun | back) >> j) & 1 else 1.0
                 move[es.MOVE_EXCESS + 3 * i + j] += part * middle[i, j] * dt
             for c in range(3):
-                move[es.MOVE_SCALE + 9 * i + 3 * j + c] += middle[i, j] * raw[c] * dt
+                move[es.MOVE_SCALE + 9 * i + 3 * j + c] += (
+                    middle[i, j] * 0.5 * (last[c] + gyr[c]) * dt)
         change = 0.0
         if par[P_USE_ACC]:
             move[es.MOVE_FORCE + i] += force * dt
@@ -364,7 +366,7 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
     result = 1
     length = par[P_BLOCK] * (_BURST_SHARE if k[CLIPPED] else 1.0)
     if back or move[es.MOVE_TIME] >= length - 1e-6:
-        _end_block(x, k, par, still, back, inside, tape)
+        _end_block(x, k, par, still, back, gyr, last, tape)
         result = 2
         k[CLIPPED] &= ~back
     if not k[st.HEADING_KNOWN]:
@@ -400,7 +402,8 @@ def _write(x, k, par, stamp, dt, gyr, acc, mag, reliability, flags, clipped, tak
                            + since ** 2 * cov[es.SURGE + i, es.SURGE + i])
         force[i] = acc[i] - x[S + es.ACC_BIAS + i]
     cov_world[2, 2] += x[HEADING_VAR]
-    rate = _rate(x, gyr)
+    rate = np.empty(3)
+    rate[:] = _rate(x, gyr)
     if not taped:    # else the smoother does it, after its correction
         st.beyond_limits(rate, clipped, x[LIMIT:LIMIT + 3])
     st.write_row(row, row_int, par, stamp, x[st.Q:st.Q + 4], cov_world, rate, var_gyr,

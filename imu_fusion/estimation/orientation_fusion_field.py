@@ -10,6 +10,7 @@ from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_layout import (
     BLOCK_MAGS, COV, HEADING_VAR, MAG_SUM, MOVE, N, NORM, P_HEADING_SD, P_LOCAL_SD,
     P_MAG_RELATIVE, P_NORM_FACTOR, P_OFFSET_SD, P_SOFT_SD, S, WORLD_TURNED)
+from imu_fusion.geometry import quaternion
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix)
 
@@ -105,30 +106,37 @@ def _fix_heading(x, k, par, z):
 
 
 @njit(cache=True)
+def _calibrated(x, raw):
+    """A sample relative to the field's norm, less offset and soft iron as known so far: a tuple."""
+    offset, soft = S + es.OFFSET, S + es.SOFT
+    return (raw[0] - x[offset] - x[soft] * raw[0] - x[soft + 1] * raw[1] - x[soft + 2] * raw[2],
+            raw[1] - x[offset + 1] - x[soft + 3] * raw[0] - x[soft + 4] * raw[1]
+            - x[soft + 5] * raw[2],
+            raw[2] - x[offset + 2] - x[soft + 6] * raw[0] - x[soft + 7] * raw[1]
+            - x[soft + 8] * raw[2])
+
+
+@njit(cache=True)
 def collect_mags(x, k, par, samples, count):
     """Add magnetometer samples to the block; returns the reliability (10) of their mean.
 
     samples: rows of take_mags. The mean in present imu axes goes to samples[0, :3], tesla.
     """
     lag_row, offset_row, soft_row = MAG_SUM + 3, MAG_SUM + 6, MAG_SUM + 15
-    mean = np.zeros(3)
     quat = x[st.Q:st.Q + 4]
     if x[NORM] == 0.0 and count > 0:
         _fix_heading(x, k, par, quat_rotate(quat_multiply(quat, samples[0, 6:10]),
                                             samples[0, :3]))
         quat = x[st.Q:st.Q + 4]
     norm = x[NORM]
+    mean = (0.0, 0.0, 0.0)
     for s in range(count):
-        raw = samples[s, :3] / norm
-        m = raw.copy()
-        for i in range(3):
-            m[i] -= x[S + es.OFFSET + i]
-            for j in range(3):
-                m[i] -= x[S + es.SOFT + 3 * i + j] * raw[j]
+        raw = (samples[s, 0] / norm, samples[s, 1] / norm, samples[s, 2] / norm)
+        m = _calibrated(x, raw)
         rate = samples[s, 3:6]
-        r = quat_to_matrix(quat_multiply(quat, samples[s, 6:10]))
-        drag = np.array([rate[1] * m[2] - rate[2] * m[1], rate[2] * m[0] - rate[0] * m[2],
-                         rate[0] * m[1] - rate[1] * m[0]])
+        r = quat_to_matrix(quaternion.multiply(quat, samples[s, 6:10]))
+        drag = (rate[1] * m[2] - rate[2] * m[1], rate[2] * m[0] - rate[0] * m[2],
+                rate[0] * m[1] - rate[1] * m[0])
         for i in range(3):
             for j in range(3):
                 x[MAG_SUM + i] += r[i, j] * m[j]
@@ -136,9 +144,11 @@ def collect_mags(x, k, par, samples, count):
                 x[offset_row + 3 * i + j] += r[i, j]
                 for c in range(3):
                     x[soft_row + 9 * i + 3 * j + c] += r[i, j] * raw[c]
-        mean += quat_rotate(samples[s, 6:10], m) / count
+        now = quaternion.rotate(samples[s, 6:10], m)
+        mean = (mean[0] + now[0] / count, mean[1] + now[1] / count, mean[2] + now[2] / count)
         k[BLOCK_MAGS] += 1
-    samples[0, :3] = mean * norm
+    for i in range(3):
+        samples[0, i] = mean[i] * norm
     size = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
     return math.exp(-(par[st.P_RELIABILITY] * (1.0 - size)) ** 2)
 

@@ -29,6 +29,7 @@ from imu_fusion.estimation.orientation_state import (
     P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_COUNT, Q, SATURATED, STARTED,
     TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
     take_mags, write_row)
+from imu_fusion.geometry import quaternion
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
     quat_to_matrix, right_jacobian, skew)
@@ -235,7 +236,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
     if k[STARTED]:
         dt = (stamp - k[LAST_STAMP]) * 1e-9
         rate = x[GYR_LAST:GYR_LAST + 3] - bias
-    push_rotation(x, k, stamp, quat_exp(0.5 * dt * (rate + rate_next)))
+    push_rotation(x, k, stamp, quaternion.exp(rate + rate_next, 0.5 * dt))
     k[LAST_STAMP] = stamp
     k[STARTED] = 1
     x[GYR_LAST:GYR_LAST + 3] = gyr

@@ -14,8 +14,8 @@ from numba import njit
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_state as st
-from imu_fusion.geometry.rotation import (
-    quat_conjugate, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix)
+from imu_fusion.geometry import quaternion
+from imu_fusion.geometry.rotation import quat_to_matrix
 
 N = es.N
 _SEGMENT = 128      # blocks between snapshots
@@ -155,12 +155,13 @@ def _clipped(row_int):
 def _correct_row(row, par, error, cov, heading_var, clipped, limits):
     """Apply the error (N,) and its covariance (12, 12) to one output row."""
     frame = par[st.P_FRAME:st.P_FRAME + 4]
-    turn = quat_exp(error[es.ATT:es.ATT + 3])
-    quat = quat_normalize(quat_multiply(turn, quat_multiply(
-        quat_conjugate(frame), row[st.ROW_QUAT:st.ROW_QUAT + 4])))
-    row[st.ROW_QUAT:st.ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, quat))
-    turn_out = quat_multiply(frame, quat_multiply(turn, quat_conjugate(frame)))
-    row[st.ROW_MAG:st.ROW_MAG + 3] = quat_rotate(turn_out, row[st.ROW_MAG:st.ROW_MAG + 3])
+    back = quaternion.conjugate(frame)
+    turn = quaternion.exp(error[es.ATT:es.ATT + 3], 1.0)
+    quat = quaternion.normalize(quaternion.multiply(turn, quaternion.multiply(
+        back, row[st.ROW_QUAT:st.ROW_QUAT + 4])))
+    row[st.ROW_QUAT:st.ROW_QUAT + 4] = quaternion.normalize(quaternion.multiply(frame, quat))
+    turn_out = quaternion.multiply(frame, quaternion.multiply(turn, back))
+    row[st.ROW_MAG:st.ROW_MAG + 3] = quaternion.rotate(turn_out, row[st.ROW_MAG:st.ROW_MAG + 3])
     rate = row[st.ROW_GYR:st.ROW_GYR + 3].copy()
     for i in range(3):
         row[st.ROW_BIAS + i] += error[es.BIAS + i]
@@ -173,12 +174,7 @@ def _correct_row(row, par, error, cov, heading_var, clipped, limits):
         if at_limit:
             row[st.ROW_COV_GYR + 4 * i] = max(cov[9 + i, 9 + i], 0.0) + cov[3 + i, 3 + i]
     st.beyond_limits(row[st.ROW_GYR:st.ROW_GYR + 3], clipped, limits)
-    r = quat_to_matrix(quat)
-    for i in range(3):
-        for j in range(3):
-            total = r[2, i] * heading_var * r[2, j]
-            for m in range(3):
-                for n in range(3):
-                    total += r[m, i] * cov[m, n] * r[n, j]
-            row[st.ROW_COV + 3 * i + j] = total + st.unseen_cov(
-                par, row[st.ROW_GYR:st.ROW_GYR + 3], i, j)
+    cov[2, 2] += heading_var
+    st.write_cov_attitude(row, par, cov, quat_to_matrix(quat),
+                          row[st.ROW_GYR:st.ROW_GYR + 3])
+    cov[2, 2] -= heading_var

@@ -16,9 +16,8 @@ import numpy as np
 from numba import njit
 
 from imu_fusion.estimation import orientation_mag_limit as limit
-from imu_fusion.geometry.rotation import (
-    quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, quat_rotate,
-    quat_to_matrix)
+from imu_fusion.geometry import quaternion
+from imu_fusion.geometry.rotation import quat_to_matrix
 
 ORIENTATION_DTYPE = np.dtype([
     ("stamp", "<i8"), ("quat_world_imu", "<f8", 4), ("cov_attitude", "<f8", (3, 3)),
@@ -141,18 +140,17 @@ def rotation_of_step(rate, rate_next, dt):
     The second term is that of coning: without it the error is of second order in dt
     where the axis of rotation moves.
     """
-    phi = np.empty(3)
-    for i in range(3):
-        j, m = (i + 1) % 3, (i + 2) % 3
-        phi[i] = (0.5 * dt * (rate[i] + rate_next[i])
-                  + dt * dt / 12.0 * (rate[j] * rate_next[m] - rate[m] * rate_next[j]))
-    return phi
+    mean, coning = 0.5 * dt, dt * dt / 12.0
+    a, b = rate, rate_next
+    return (mean * (a[0] + b[0]) + coning * (a[1] * b[2] - a[2] * b[1]),
+            mean * (a[1] + b[1]) + coning * (a[2] * b[0] - a[0] * b[2]),
+            mean * (a[2] + b[2]) + coning * (a[0] * b[1] - a[1] * b[0]))
 
 
 @njit(cache=True)
 def push_rotation(x, k, stamp, turn):
     """Turn the gyroscope chain by a quaternion (4,), imu axes, and remember it at ``stamp``."""
-    u = quat_normalize(quat_multiply(x[U:U + 4], turn))
+    u = quaternion.normalize(quaternion.multiply(x[U:U + 4], turn))
     x[U:U + 4] = u
     slot = k[HISTORY_COUNT] % HISTORY_LENGTH
     x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4] = u
@@ -174,15 +172,18 @@ def rotation_since(x, k, stamp, turn, rate):
         slot = (count - 1 - back) % HISTORY_LENGTH
         here = k[HISTORY_STAMPS + slot]
         if here < stamp or (here == stamp and (newer >= 0 or count == 1)):
-            u = x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4].copy()
+            since = quaternion.multiply(quaternion.conjugate(x[U:U + 4]),
+                                        x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4])
             rate[:] = 0.0
             if newer >= 0:
-                u_newer = x[HISTORY + 4 * newer:HISTORY + 4 * newer + 4]
+                step = quaternion.log(quaternion.multiply(
+                    quaternion.conjugate(x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4]),
+                    x[HISTORY + 4 * newer:HISTORY + 4 * newer + 4]))
                 span = k[HISTORY_STAMPS + newer] - here
-                step = quat_log(quat_multiply(quat_conjugate(u), u_newer))
-                rate[:] = step / (span * 1e-9)
-                u = quat_multiply(u, quat_exp((stamp - here) / span * step))
-            turn[:] = quat_multiply(quat_conjugate(x[U:U + 4]), u)
+                for i in range(3):
+                    rate[i] = step[i] / (span * 1e-9)
+                since = quaternion.multiply(since, quaternion.exp(step, (stamp - here) / span))
+            turn[:] = since
             return True
         newer = slot
     return False
@@ -284,10 +285,20 @@ def beyond_limits(rate, clipped, limits):
 
 
 @njit(cache=True)
-def unseen_cov(par, rate, i, j):
-    """Element of the attitude's covariance, imu axes, that no filter on these sensors can see:
-    their axes in the case, and a delay of the rates, by which a turn of ``rate`` (3,) is late."""
-    return par[P_DELAY_SD] ** 2 * rate[i] * rate[j] + (par[P_AXES_SD] ** 2 if i == j else 0.0)
+def write_cov_attitude(row, par, cov_world, r, rate):
+    """Covariance of the attitude's error, imu axes, from that in world axes (3, 3) or larger.
+
+    It gets what no filter on these sensors can see: their axes in the case, and a delay of
+    the rates, by which a turn of ``rate`` (3,) is late. r (3, 3): from imu to world axes.
+    """
+    for j in range(3):
+        a = cov_world[0, 0] * r[0, j] + cov_world[0, 1] * r[1, j] + cov_world[0, 2] * r[2, j]
+        b = cov_world[1, 0] * r[0, j] + cov_world[1, 1] * r[1, j] + cov_world[1, 2] * r[2, j]
+        c = cov_world[2, 0] * r[0, j] + cov_world[2, 1] * r[1, j] + cov_world[2, 2] * r[2, j]
+        late = par[P_DELAY_SD] ** 2 * rate[j]
+        for i in range(3):
+            row[ROW_COV + 3 * i + j] = r[0, i] * a + r[1, i] * b + r[2, i] * c + rate[i] * late
+        row[ROW_COV + 4 * j] += par[P_AXES_SD] ** 2
 
 
 @njit(cache=True)
@@ -300,19 +311,13 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
     mag (3,) is in imu axes, nan if none. Flags and mag_count share a 64-bit word.
     """
     frame = par[P_FRAME:P_FRAME + 4]
-    ahead = quat_multiply(quat, quat_exp(par[P_GYR_DELAY] * gyr))
+    ahead = quaternion.multiply(quat, quaternion.exp(gyr, par[P_GYR_DELAY]))
     row_int[ROW_STAMP] = stamp
-    row[ROW_QUAT:ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
+    row[ROW_QUAT:ROW_QUAT + 4] = quaternion.normalize(quaternion.multiply(frame, ahead))
     r = quat_to_matrix(ahead)
-    half = np.empty((3, 3))
-    for m in range(3):
-        for j in range(3):
-            half[m, j] = (cov_world[m, 0] * r[0, j] + cov_world[m, 1] * r[1, j]
-                          + cov_world[m, 2] * r[2, j])
+    write_cov_attitude(row, par, cov_world, r, gyr)
     for i in range(3):
         for j in range(3):
-            total = r[0, i] * half[0, j] + r[1, i] * half[1, j] + r[2, i] * half[2, j]
-            row[ROW_COV + 3 * i + j] = total + unseen_cov(par, gyr, i, j)
             row[ROW_COV_GYR + 3 * i + j] = var_gyr[i] if i == j else 0.0
             row[ROW_COV_ACC + 3 * i + j] = var_acc if i == j else 0.0
     for i in range(3):
@@ -320,6 +325,6 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
         row[ROW_ACC + i] = acc[i]
         row[ROW_BIAS + i] = bias[i]
         row[ROW_BIAS_SD + i] = math.sqrt(max(bias_var[i], 0.0))
-    row[ROW_MAG:ROW_MAG + 3] = quat_rotate(frame, quat_rotate(quat, mag))
+    row[ROW_MAG:ROW_MAG + 3] = quaternion.rotate(frame, quaternion.rotate(quat, mag))
     row[ROW_RELIABILITY] = reliability
     row_int[FLAGS_WORD] = flags + (mag_count << 32)

@@ -1,9 +1,8 @@
 """Rotation kernels for hot loops (numba, scalar, no broadcasting).
 
 Quaternions are Hamilton, active, ``x, y, z, w``. Arrays are float64 and
-one-dimensional; whole logs are better served by ``scipy.spatial.transform``.
-The exponential and the logarithm switch to series near zero, where the closed
-forms lose digits.
+one-dimensional; whole logs are better served by ``scipy.spatial.transform``. Where an array per
+call costs too much, :mod:`imu_fusion.geometry.quaternion` has the same with tuples.
 """
 
 import math
@@ -11,9 +10,16 @@ import math
 import numpy as np
 from numba import njit
 
-# Below this angle the truncated series are exact to float64 rounding:
-# the first neglected term is of the order angle^6 / 5040 of the value.
-_SMALL = 1e-3
+from imu_fusion.geometry import quaternion
+
+
+@njit(cache=True)
+def _array(values):
+    """A tuple of floats as an array."""
+    out = np.empty(len(values))
+    for i in range(len(values)):
+        out[i] = values[i]
+    return out
 
 
 @njit(cache=True)
@@ -32,29 +38,19 @@ def skew(v):
 @njit(cache=True)
 def quat_multiply(p, q):
     """Hamilton product p * q. p, q: (4,). Returns (4,)."""
-    r = np.empty(4)
-    r[0] = p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1]
-    r[1] = p[3] * q[1] - p[0] * q[2] + p[1] * q[3] + p[2] * q[0]
-    r[2] = p[3] * q[2] + p[0] * q[1] - p[1] * q[0] + p[2] * q[3]
-    r[3] = p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2]
-    return r
+    return _array(quaternion.multiply(p, q))
 
 
 @njit(cache=True)
 def quat_conjugate(q):
     """Inverse of a unit quaternion. q: (4,). Returns (4,)."""
-    r = np.empty(4)
-    r[0] = -q[0]
-    r[1] = -q[1]
-    r[2] = -q[2]
-    r[3] = q[3]
-    return r
+    return _array(quaternion.conjugate(q))
 
 
 @njit(cache=True)
 def quat_normalize(q):
     """q scaled to unit length. q: (4,), not zero. Returns (4,)."""
-    return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return _array(quaternion.normalize(q))
 
 
 @njit(cache=True)
@@ -123,15 +119,7 @@ def quat_to_rpy(q):
 @njit(cache=True)
 def quat_rotate(q, v):
     """v turned by the unit quaternion q. q: (4,), v: (3,). Returns (3,)."""
-    x, y, z, w = q[0], q[1], q[2], q[3]
-    tx = 2.0 * (y * v[2] - z * v[1])
-    ty = 2.0 * (z * v[0] - x * v[2])
-    tz = 2.0 * (x * v[1] - y * v[0])
-    r = np.empty(3)
-    r[0] = v[0] + w * tx + y * tz - z * ty
-    r[1] = v[1] + w * ty + z * tx - x * tz
-    r[2] = v[2] + w * tz + x * ty - y * tx
-    return r
+    return _array(quaternion.rotate(q, v))
 
 
 @njit(cache=True)
@@ -143,37 +131,13 @@ def quat_rotate_inverse(q, v):
 @njit(cache=True)
 def quat_exp(phi):
     """Unit quaternion of a rotation vector. phi: (3,) rad. Returns (4,)."""
-    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    angle = math.sqrt(angle2)
-    if angle < _SMALL:
-        s = 0.5 - angle2 / 48.0 + angle2 * angle2 / 3840.0
-    else:
-        s = math.sin(0.5 * angle) / angle
-    q = np.empty(4)
-    q[0] = s * phi[0]
-    q[1] = s * phi[1]
-    q[2] = s * phi[2]
-    q[3] = math.cos(0.5 * angle)
-    return q
+    return _array(quaternion.exp(phi, 1.0))
 
 
 @njit(cache=True)
 def quat_log(q):
     """Rotation vector of a unit quaternion, of angle at most pi. Returns (3,) rad."""
-    n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
-    n = math.sqrt(n2)
-    sign = 1.0 if q[3] >= 0.0 else -1.0
-    w = abs(q[3])
-    if n < _SMALL:
-        t = n / w
-        s = 2.0 / w * (1.0 - t * t / 3.0 + t ** 4 / 5.0)
-    else:
-        s = 2.0 * math.atan2(n, w) / n
-    phi = np.empty(3)
-    phi[0] = sign * s * q[0]
-    phi[1] = sign * s * q[1]
-    phi[2] = sign * s * q[2]
-    return phi
+    return _array(quaternion.log(q))
 
 
 @njit(cache=True)
