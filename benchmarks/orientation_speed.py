@@ -1,8 +1,9 @@
 """Speed of the orientation step beside vqf, imufusion and ahrs, in one run.
 
 us of processor time per sample on one synthetic recording (100 s, 286 Hz, magnetometer at
-the same rate), best of three; ``single call`` is one Python call per sample. Cold: a
-fresh interpreter with an empty numba cache compiles; warm: the cache is filled.
+the same rate), best of seven rounds over all; ``single call`` is one Python call per
+sample. Cold: a fresh interpreter with an empty numba cache compiles; warm: the cache is
+filled.
 """
 
 import os
@@ -31,14 +32,16 @@ print(time.process_time() - start)
 """
 
 
-def per_sample(run, count, repeats=3):
-    """Best processor time of ``run()`` in us per sample; other load does not count."""
-    best = float("inf")
-    for _ in range(repeats):
-        start = time.process_time()
-        run()
-        best = min(best, time.process_time() - start)
-    return best / count * 1e6
+def best_times(runs, rounds=7):
+    """Least processor time of each run, s. In rounds, so that a slow spell of the machine meets
+    all; the first round compiles."""
+    best = [float("inf")] * len(runs)
+    for _ in range(1 + rounds):
+        for i, run in enumerate(runs):
+            start = time.process_time()
+            run()
+            best[i] = min(best[i], time.process_time() - start)
+    return best
 
 
 def starts(method):
@@ -94,17 +97,11 @@ def main():
         ("imufusion", None, imufusion_single),
         ("Madgwick (ahrs)", lambda: ahrs.filters.Madgwick(
             imu.gyr[:3000], imu.acc[:3000], mag_ut[:3000] * 1e3, frequency=286.0), None)]
+    best = iter(best_times([run for _, *runs in measured for run in runs if run]))
     rows = []
-    for name, run_batch, run_single in measured:
+    for name, *runs in measured:
         count = 3000 if name.startswith("Madgwick") else n
-        times = []
-        for run in (run_batch, run_single):
-            if run is None:
-                times.append(None)
-                continue
-            run()
-            times.append(per_sample(run, count))
-        rows.append([name, *times])
+        rows.append([name, *(next(best) / count * 1e6 if run else None for run in runs)])
     reference = next(row[1] for row in rows if row[0] == "VQF")
     cells = [[name, *("" if t is None else f"{t:.2f}" for t in times),
               "" if times[0] is None else f"{times[0] / reference:.1f}"]
@@ -115,8 +112,8 @@ def main():
     write_table("orientation_speed", [
         "estimator", "batch, us/sample", "single call, us", "batch relative to VQF",
         "first result cold / warm, s"], cells,
-        note="Processor time. Ours includes both calls, magnetometer and Imu, and writes covariances, bias and "
-             "flags with every row.")
+        note="Processor time. Ours includes both calls, magnetometer and Imu, and writes "
+             "covariances, bias and flags with every row.")
 
 
 if __name__ == "__main__":
