@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 
 from imu_fusion.estimation import orientation_mag_limit as limit
-from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
+from imu_fusion.geometry import quaternion
+from imu_fusion.geometry.rotation import quat_from_matrix
 
 # Largest rate that can be a gyroscope's bias, and largest scatter of rate and specific
 # force that passes as rest on a table or in a quiet hand (consumer MEMS, Nyquist-band noise).
@@ -97,10 +98,13 @@ def usable_mags(mag, ranges):
 def _chain(stamps, gyr):
     """(n, 4) rotations from each sample's axes into the first's, by trapezoidal rates."""
     chain = np.empty((len(stamps), 4))
-    chain[0] = np.array([0.0, 0.0, 0.0, 1.0])
+    quat = (0.0, 0.0, 0.0, 1.0)
+    chain[0] = quat
     for i in range(1, len(stamps)):
         dt = (stamps[i] - stamps[i - 1]) * 1e-9
-        chain[i] = quat_multiply(chain[i - 1], quat_exp(0.5 * dt * (gyr[i - 1] + gyr[i])))
+        twice = (gyr[i - 1, 0] + gyr[i, 0], gyr[i - 1, 1] + gyr[i, 1], gyr[i - 1, 2] + gyr[i, 2])
+        quat = quaternion.multiply(quat, quaternion.exp(twice, 0.5 * dt))
+        chain[i] = quat
     return chain
 
 
@@ -108,7 +112,7 @@ def _chain(stamps, gyr):
 def _rotate_all(chain, vectors):
     out = np.empty_like(vectors)
     for i in range(len(vectors)):
-        out[i] = quat_rotate(chain[i], vectors[i])
+        out[i] = quaternion.rotate(chain[i], vectors[i])
     return out
 
 

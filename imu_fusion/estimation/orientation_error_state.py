@@ -214,7 +214,7 @@ def move_adjoint(move, adjoint):
 
 
 @njit(cache=True)
-def update(cov, error, states, count, index, coefficient, residual, variance, tape):
+def update(cov, error, states, index, coefficient, residual, variance, tape):
     """One scalar measurement of the error state, in place.
 
     residual = sum_a coefficient[a] error[index[a]] + noise of ``variance``.
@@ -222,9 +222,10 @@ def update(cov, error, states, count, index, coefficient, residual, variance, ta
     Args:
         cov: (N, N). error: (N,) mean of the error so far.
         states: how many of them there are; the others are zero.
-        count, index, coefficient: the measurement's row, sparse.
+        index, coefficient: (m,) the measurement's row, sparse.
         tape: a block's tape, or an empty array.
     """
+    count = len(index)
     spread = np.zeros(N)
     for a in range(count):
         c = coefficient[a]

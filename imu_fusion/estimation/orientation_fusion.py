@@ -208,17 +208,17 @@ def _end_block(x, k, par, still, back, gyr, last, tape):
 
     scale = _motion_scale(x, par, cov, move)
     error = np.zeros(N)
-    index = np.empty(es.OP_WIDTH, dtype=np.int64)
-    row = np.ones(es.OP_WIDTH)
+    index = np.empty(1, dtype=np.int64)
+    row = np.ones(1)
     for i in range(3):
         if (back >> i) & 1:
             index[0] = es.EXCESS + i
-            es.update(cov, error, states, 1, index, row, gyr[i] - last[i]
+            es.update(cov, error, states, index, row, gyr[i] - last[i]
                       - x[S + es.EXCESS + i], _BACK_SD ** 2, tape)
     for i in range(3):
         if still:
             index[0] = es.BIAS + i
-            es.update(cov, error, states, 1, index, row, mean_rate(x, i) - x[S + es.BIAS + i],
+            es.update(cov, error, states, index, row, mean_rate(x, i) - x[S + es.BIAS + i],
                       par[P_REST_RATE_SD] ** 2 * REST_MEMORY / time, tape)
         if not par[P_USE_ACC]:
             continue    # without force, velocity and position tell nothing
@@ -226,9 +226,9 @@ def _end_block(x, k, par, still, back, gyr, last, tape):
         index[0] = es.VEL + i
         variance = (_REST_SPEED_SD ** 2 * 0.02 / time if still
                     else scale ** 3 * par[P_VEL_SD] ** 2 * max(par[P_VEL_TIME] / time, 1.0))
-        es.update(cov, error, states, 1, index, row, -x[S + es.VEL + i], variance, tape)
+        es.update(cov, error, states, index, row, -x[S + es.VEL + i], variance, tape)
         index[0] = es.POS + i
-        es.update(cov, error, states, 1, index, row, -x[S + es.POS + i],
+        es.update(cov, error, states, index, row, -x[S + es.POS + i],
                   scale ** 5 * par[P_POS_SD] ** 2 * max(par[P_POS_TIME] / time, 1.0), tape)
     if k[BLOCK_MAGS] > 0:
         update_mag(x, k, par, error, still, tape)
@@ -435,11 +435,12 @@ def run_loop(x, k, par, imu_stamps, samples, mag_stamps, mags, rows, rows_int):
     """
     written = 0
     j = 0
+    tape = np.empty(0)
     for i in range(len(imu_stamps)):
         while j < len(mag_stamps) and mag_stamps[j] <= imu_stamps[i]:
             push_mag(x, k, par, mag_stamps[j], mags[j])
             j += 1
-        if step_imu(x, k, par, imu_stamps[i], samples[i], rows[written], rows_int[written]):
+        if advance(x, k, par, imu_stamps[i], samples[i], rows[written], rows_int[written], tape):
             written += 1
     while j < len(mag_stamps):
         push_mag(x, k, par, mag_stamps[j], mags[j])

@@ -47,9 +47,10 @@ def start_field(x, k, par, z, has_heading, follow):
     quat = x[st.Q:st.Q + 4]
     r = quat_to_matrix(quat)
     m = quat_rotate_inverse(quat, b)
-    index = np.empty(es.OP_WIDTH, dtype=np.int64)
-    row = np.empty(es.OP_WIDTH)
+    index = np.empty(_MAG_STATES, dtype=np.int64)
+    row = np.empty(_MAG_STATES)
     error = np.zeros(N)
+    states = len(error)
     for i in range(3):
         _mag_row(i, b, index, row)
         row[4] = 0.0
@@ -57,13 +58,13 @@ def start_field(x, k, par, z, has_heading, follow):
             row[5 + c] = r[i, c] * follow
             for d in range(3):
                 row[8 + 3 * c + d] = r[i, c] * m[d] * follow
-        es.update(cov, error, N, _MAG_STATES, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+        es.update(cov, error, states, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
     if has_heading and follow:
         for c in range(2):
             index[c], index[2 + c] = es.FIELD + c, es.LOCAL + c
         row[0] = row[2] = math.cos(par[st.P_DECLINATION])
         row[1] = row[3] = -math.sin(par[st.P_DECLINATION])
-        es.update(cov, error, N, 4, index, row, 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
+        es.update(cov, error, states, index[:4], row[:4], 0.0, _FIRST_FIELD_SD ** 2, np.empty(0))
 
 
 @njit(cache=True)
@@ -87,11 +88,9 @@ def _fix_heading(x, k, par, z):
     k[WORLD_TURNED] = 1
     horizontal = math.hypot(z[0], z[1])
     norm = math.sqrt(horizontal ** 2 + z[2] ** 2)
-    if horizontal < 0.02 * norm:
-        start_field(x, k, par, z, False, 0.0)
-        return
+    known = horizontal >= 0.02 * norm
     # The needle points to azimuth D: east sin D, north cos D.
-    angle = 0.5 * math.pi - par[st.P_DECLINATION] - math.atan2(z[1], z[0])
+    angle = 0.5 * math.pi - par[st.P_DECLINATION] - math.atan2(z[1], z[0]) if known else 0.0
     turn = quat_exp(np.array([0.0, 0.0, angle]))
     x[st.Q:st.Q + 4] = quat_multiply(turn, x[st.Q:st.Q + 4])
     cov = x[COV:COV + N * N].reshape(N, N)
@@ -102,7 +101,7 @@ def _fix_heading(x, k, par, z):
         for j in range(N):
             cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3].copy())
     # The sensor may be moving: what it shows now is no anchor.
-    start_field(x, k, par, quat_rotate(turn, z), True, 1.0)
+    start_field(x, k, par, quat_rotate(turn, z), known, 1.0 if known else 0.0)
 
 
 @njit(cache=True)
@@ -171,8 +170,8 @@ def update_mag(x, k, par, error, still, tape):
     sd = par[P_MAG_RELATIVE] + par[P_NORM_FACTOR] * deviation
     # White over 20 ms: faster sampling of the same disturbance is no news.
     variance = sd * sd * max(0.02 / time, 1.0 / count) + (par[st.P_MAG_SD] / x[NORM]) ** 2 / count
-    index = np.empty((3, es.OP_WIDTH), dtype=np.int64)
-    row = np.empty((3, es.OP_WIDTH))
+    index = np.empty((3, _MAG_STATES), dtype=np.int64)
+    row = np.empty((3, _MAG_STATES))
     distance = 0.0
     for i in range(3):
         _mag_row(i, expected, index[i], row[i])
@@ -184,7 +183,7 @@ def update_mag(x, k, par, error, still, tape):
         distance += _distance(cov, error, index[i], row[i], z[i] - expected[i], variance)
     variance *= (_TAIL_DOF + distance) / (_TAIL_DOF + 3.0)
     for i in range(3):
-        es.update(cov, error, states, _MAG_STATES, index[i], row[i], z[i] - expected[i], variance, tape)
+        es.update(cov, error, states, index[i], row[i], z[i] - expected[i], variance, tape)
 
 
 @njit(cache=True)

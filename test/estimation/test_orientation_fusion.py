@@ -398,7 +398,7 @@ def test_update_and_its_adjoint_against_dense_algebra():
     gain = cov @ h / total
     tape = np.zeros(es.TAPE_SIZE)
     updated, error = cov.copy(), np.zeros(es.N)
-    es.update(updated, error, es.N, 3, index, coefficient, 0.7, 0.3, tape)
+    es.update(updated, error, es.N, index, coefficient, 0.7, 0.3, tape)
     assert error == pytest.approx(gain * 0.7)
     assert updated == pytest.approx(cov - np.outer(gain, h @ cov))
 
