@@ -9,9 +9,10 @@ few terms:
     dp'     = dv                                    position, m
 
 Gyroscope model: rate = gyr_raw + S gyr_raw - bias + excess, excess only on axes at
-their limit; there dexcess' = dsurge, dsurge' = -dsurge / time (Singer 1970). Magnetometer model, relative to the field's norm:
-``m_true = m - C m - offset`` and ``R m_true = field + local``, ``local`` being what
-distinguishes the place from its surroundings.
+their limit; there dexcess' = dsurge, dsurge' = -dsurge / time (Singer 1970).
+Magnetometer model, relative to the field's norm: ``m_true = m - C m - offset`` and
+``R m_true = field + local``, ``local`` being what distinguishes the place from its
+surroundings.
 
 A prediction is described by a few blocks instead of its full matrix (MOVE below);
 predictions and updates can be written to a tape, which the smoother reads backwards.

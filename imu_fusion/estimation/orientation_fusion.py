@@ -59,9 +59,9 @@ def pack(par, p):
         p.block, p.velocity_walk, p.velocity_sd, p.velocity_time, p.position_sd,
         p.position_time, p.local_field_sd, p.local_field_time, p.field_walk, p.mag_sd,
         p.norm_deviation_factor, p.rest_rate, p.rest_force, p.rest_time, p.rest_rate_sd,
-        p.surge_sd, p.surge_time, p.estimate_bias, p.gyro_scale_sd, p.mag_offset_sd, p.mag_matrix_sd,
-        p.mag_delay_sd if p.mag_delay is None else 0.0, p.heading_anchor == "field",
-        math.radians(p.heading_sd_deg), p.use_acc)
+        p.surge_sd, p.surge_time, p.estimate_bias, p.gyro_scale_sd, p.mag_offset_sd,
+        p.mag_matrix_sd, p.mag_delay_sd if p.mag_delay is None else 0.0,
+        p.heading_anchor == "field", math.radians(p.heading_sd_deg), p.use_acc)
 
 
 def initialise(x, k, par, a):
@@ -133,7 +133,7 @@ def _surge_gain(par, time):
 
 @njit(cache=True)
 def _surge_noise(par, time):
-    """Variances of surge and excess that ``time`` (s) adds (Singer 1970, (5))."""
+    """Variances of surge and excess that ``time`` (s) adds (Singer 1970)."""
     part = time / par[P_SURGE_TIME]
     keep = math.exp(-part)
     # The series where the closed form would be a small difference of large numbers.
