@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from imu_fusion.compiling import announced_compiling
 from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation import OrientationParams
 from imu_fusion.messages import acceleration_field_stream as field_stream
@@ -173,7 +174,7 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
         progress(f"reading {', '.join(wanted)} from {Path(bag).name}")
         logs = _read(reader, wanted, kinds)
         warnings = list(reader.warnings)
-    with BagWriter(out, overwrite=overwrite) as writer:
+    with BagWriter(out, overwrite=overwrite) as writer, announced_compiling(progress):
         for stage, report, names in chosen:
             inputs, recorded = {}, {}
             for topic, name in names.items():

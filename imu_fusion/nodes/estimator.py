@@ -1,7 +1,10 @@
 """What the nodes of all streaming estimators share: a Stream between DDS topics."""
 
+from contextlib import ExitStack
+
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from imu_fusion.compiling import announced_compiling
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
@@ -10,6 +13,15 @@ from imu_fusion.samples.guard import Verdict
 
 class EstimatorNode(Node):
     """A node around a :class:`imu_fusion.messages.streams.Stream`; also the relay's stage."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self._announcing = ExitStack()
+        self._announcing.enter_context(announced_compiling(self.get_logger().info))
+
+    def close(self):
+        self._announcing.close()
+        super().close()
 
     def attach(self, stream, outputs):
         """Subscribe to the stream's inputs and advertise ``outputs`` (topic to type name)."""

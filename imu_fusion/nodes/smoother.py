@@ -1,6 +1,7 @@
 """The smoother as a node: collects, smooths in a child process when asked, publishes."""
 
 import multiprocessing
+import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -9,6 +10,7 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from imu_fusion.compiling import announced_compiling
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.messages import smoothing
 from imu_fusion.messages.smoothing import (INPUTS, OUTPUTS, Collection, SmootherNodeParams,
@@ -23,7 +25,8 @@ _POLL = 0.002  # s between callbacks while a child smooths, see work()
 def _smooth_in_child(connection, params, logs):
     """Entry point of the child process: sends (summary, messages) or (None, reason)."""
     try:
-        result = smoothing.smooth(params, logs)
+        with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
+            result = smoothing.smooth(params, logs)
         frame_id = logs[smoothing.IMU_TOPIC][0].frame_id
         connection.send(("; ".join([result.summary(), *result.remarks()]),
                          list(smoothing.messages(result, frame_id, params.path_rate))))
