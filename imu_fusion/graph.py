@@ -11,6 +11,7 @@ from pathlib import Path
 
 import yaml
 
+from imu_fusion.compiling import NOTICE
 from imu_fusion.errors import ImuFusionError
 
 
@@ -54,6 +55,7 @@ class Graph:
         self._logs = Path(logs or tempfile.mkdtemp(prefix="imu_fusion_"))
         self._logs.mkdir(parents=True, exist_ok=True)
         self._processes = {}
+        self._announced = False
 
     def __enter__(self):
         return self
@@ -104,6 +106,7 @@ class Graph:
         """
         deadline = time.monotonic() + timeout
         while self._processes[node].poll() is None:
+            self._announce_compiling()
             for name, process in self._processes.items():
                 if process.poll():
                     raise GraphError(f"node {name} ended with code {process.returncode}: "
@@ -139,6 +142,12 @@ class Graph:
             process.send_signal(signal.SIGINT)
         self.wait(node, 15.0)
         return by_itself
+
+    def _announce_compiling(self):
+        """Say once what a node says into its log only."""
+        if not self._announced and any(NOTICE in self.log(node) for node in self._processes):
+            self._announced = True
+            print(NOTICE, file=sys.stderr, flush=True)
 
     def log(self, node):
         """What a node has printed so far."""
