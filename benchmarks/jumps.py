@@ -24,6 +24,10 @@ class Scores:
         """Position, velocity, attitude; ideal 3."""
         return self.rows[:, 9:12].mean(axis=0)
 
+    def nees_error(self):
+        """Standard error of :meth:`nees` over the seeds."""
+        return self.rows[:, 9:12].std(axis=0) / np.sqrt(len(self.rows))
+
     def cells(self):
         """Cells of a table row."""
         r, n = self.rms(), self.nees()

@@ -266,8 +266,10 @@ def report(bag, estimates, params_file, out):
     The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
     recording of --estimates) holds imu/data. A reference in BAG shows the errors.
     """
+    from imu_fusion.compiling import announced_compiling
     from imu_fusion.report.recording import write_recording_report
-    write_recording_report(bag, estimates, out, params_file)
+    with announced_compiling(lambda text: click.echo(text, err=True)):
+        write_recording_report(bag, estimates, out, params_file)
     click.echo(f"written: {out}")
 
 
