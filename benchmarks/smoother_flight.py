@@ -4,12 +4,16 @@ No truth: normalised innovations tell whether the model fits, and the attitude i
 the autopilot's own filter (an estimate as well).
 """
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.signal import coherence, csd, welch
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.data import data_path
 from benchmarks.jumps import write
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.inputs import even_stamps
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 
@@ -104,10 +108,9 @@ def spread_deg(angle):
     return float(np.sqrt(np.mean(((angle + 180.0) % 360.0 - 180.0) ** 2)))
 
 
-def acceleration_misfit(stamp, quat, imu, velocity, late):
-    """RMS (east, north, up) m/s^2 by which the force, turned by quat and freed from gravity,
-    misses the change of GNSS velocity, over steps of about a second in flight. Neither wind nor
-    compass enters."""
+def velocity_changes(stamp, quat, imu, velocity, late):
+    """In flight: what the force, turned by quat and freed from gravity, has added to the velocity
+    by each fix (m, 3) m/s, the GNSS velocity (m, 3) m/s, and the times of both (m,) s."""
     since = (imu.stamp - imu.stamp[0]) * 1e-9
     force = np.column_stack([np.interp((stamp - imu.stamp[0]) * 1e-9, since, c)
                              for c in imu.acc.T])
@@ -118,9 +121,34 @@ def acceleration_misfit(stamp, quat, imu, velocity, late):
     fixes = (velocity.stamp - stamp[0]) * 1e-9 - late
     use = np.flatnonzero((fixes > FLYING) & (fixes < at[-1]))
     gained = np.column_stack([np.interp(fixes[use], at, c) for c in speed.T])
-    v = velocity.vel_world[use]
-    miss = (gained[5:] - gained[:-5] - v[5:] + v[:-5]) / (fixes[use][5:] - fixes[use][:-5])[:, None]
+    return gained, velocity.vel_world[use], fixes[use]
+
+
+def acceleration_misfit(stamp, quat, imu, velocity, late):
+    """RMS (east, north, up) m/s^2 by which the force misses the change of GNSS velocity, over
+    steps of about a second in flight. Neither wind nor compass enters."""
+    gained, v, time = velocity_changes(stamp, quat, imu, velocity, late)
+    miss = (gained[5:] - gained[:-5] - v[5:] + v[:-5]) / (time[5:] - time[:-5])[:, None]
     return np.sqrt(np.mean(miss ** 2, axis=0))
+
+
+def receiver_gains(stamp, quat, imu, velocity, late):
+    """Lines of a table: how much of the inertial change of velocity the receiver shows, by
+    frequency, and the coherence of the two."""
+    gained, v, _ = velocity_changes(stamp, quat, imu, replace(
+        velocity, stamp=even_stamps(velocity.stamp)), late)
+    steps, shown = np.diff(gained, axis=0), np.diff(v, axis=0)
+    spectra = dict(fs=5.0, nperseg=50, axis=0)
+    frequency, power = welch(steps, **spectra)
+    gain = np.abs(csd(steps, shown, **spectra)[1]) / power
+    common = coherence(steps, shown, **spectra)[1]
+    lines = ["| frequency, Hz | gain east/north/up | coherence |", "|---|---|---|"]
+    for i in (1, 4, 7, 10, 13):
+        lines.append(f"| {frequency[i]:.1f} | " + " | ".join(
+            "/".join(f"{value:.2f}" for value in row[i]) for row in (gain, common)) + " |")
+    return ["What the receiver's velocity shows of the inertial one:", "", *lines, "",
+            "The vertical velocity is smoothed: neighbouring fixes share its error. Noise of the "
+            "inertial one lowers the gain by the coherence at most."]
 
 
 def attitudes(result, data):
@@ -129,6 +157,7 @@ def attitudes(result, data):
     imu, mag, fix, velocity, (stamp, reference) = data
     late = result.states["gnss_time_offset"][0][0, 0]
     samples = result.samples
+    gains = receiver_gains(samples["stamp"], samples["quat_world_imu"], imu, velocity, late)
     ours = Slerp((samples["stamp"] - stamp[0]) * 1e-9, Rotation.from_quat(
         samples["quat_world_imu"]))((stamp - stamp[0]) * 1e-9).as_quat()
     since = (stamp - stamp[0]) * 1e-9
@@ -151,7 +180,8 @@ def attitudes(result, data):
     lines += ["", "The two differ by "
               + "/".join(f"{a:.1f}" for a in np.sqrt(np.mean(difference ** 2, axis=0)))
               + f" deg RMS about east/north/up. Declination there is {east:.1f} deg. A heading "
-              "differs from the course by the wind as well; the last column is free of it."]
+              "differs from the course by the wind as well; the last column is free of it.",
+              "", *gains]
     return lines
 
 
