@@ -15,6 +15,7 @@ from imu_fusion.estimation import orientation_fusion as fusion
 from imu_fusion.estimation import orientation_gyro_mag as gyro_mag
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_alignment import align, usable_mags
+from imu_fusion.estimation.orientation_fusion_detect import limits_of
 from imu_fusion.estimation.orientation_lag import FixedLag
 from imu_fusion.estimation.orientation_params import OrientationParams
 from imu_fusion.estimation.orientation_smoother import smooth
@@ -339,6 +340,7 @@ class OrientationEstimator:
     def _align(self, stamps, samples, mag_stamps, mag):
         p, par = self.params, self._par
         usable = usable_mags(mag, par[st.P_MAG_RANGE:st.P_MAG_RANGE + 3])
+        usable &= mag_stamps >= stamps[0]    # how the sensor turned before, nobody knows
         mag_stamps, mag = mag_stamps[usable], mag[usable]
         calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
                       @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
@@ -346,7 +348,8 @@ class OrientationEstimator:
             stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
             declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
             gyr_density=p.gyro_noise_density, gyr_bias_sd=p.gyro_bias_sd,
-            acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd)
+            acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd,
+            gyr_limits=limits_of(samples[:, :3], par))
         if not self._alignment.has_heading and self._yaw:
             turn = self._yaw - quat_to_rpy(self._alignment.quat_world_imu)[2]
             self._alignment = replace(self._alignment, quat_world_imu=quat_multiply(

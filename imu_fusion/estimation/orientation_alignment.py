@@ -14,6 +14,7 @@ from numba import njit
 from imu_fusion.estimation import orientation_mag_limit as limit
 from imu_fusion.geometry import quaternion
 from imu_fusion.geometry.rotation import quat_from_matrix
+from imu_fusion.sensors.saturation import saturated_axes
 
 # Largest rate that can be a gyroscope's bias, and largest scatter of rate and specific
 # force that passes as rest on a table or in a quiet hand (consumer MEMS, Nyquist-band noise).
@@ -36,7 +37,7 @@ class Alignment:
     field_world (3,) tesla or None; gyr_bias (3,), gyr_bias_sd rad/s; at_rest;
     has_heading: whether a magnetometer fixed the heading; inclination (rad, down
     positive) and field_norm (tesla) of the mean field, nan without one; gravity
-    (m/s^2): norm of the mean specific force.
+    (m/s^2): norm of the mean specific force at rest, else the standard one.
     """
 
     quat_world_imu: np.ndarray
@@ -117,7 +118,7 @@ def _rotate_all(chain, vectors):
 
 
 def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr_density,
-          gyr_bias_sd, acc_bias_sd, mag_sd):
+          gyr_bias_sd, acc_bias_sd, mag_sd, gyr_limits=math.inf):
     """Initial orientation, gyroscope bias and field from the first samples.
 
     Args:
@@ -129,6 +130,8 @@ def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr
         gyr_bias_sd: rad/s, of a bias that was not seen at rest.
         acc_bias_sd: m/s^2.
         mag_sd: tesla, of one sample.
+        gyr_limits: rad/s, scalar or (3,). From a rate at its limit on nobody knows how the
+            sensor turned: only samples before it are used.
 
     Returns:
         Alignment. Never raises for poor data: the covariance says how poor.
@@ -147,9 +150,11 @@ def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr
         bias_sd = math.hypot(gyr_density / math.sqrt(duration), 0.5 * drift)
     else:
         bias, bias_sd = np.zeros(3), gyr_bias_sd
-    chain = _chain(imu_stamps, gyr - bias)
+    lost = np.flatnonzero(saturated_axes(gyr, gyr_limits).any(axis=1))
+    used = max(int(lost[0]), 1) if len(lost) else n
+    chain = _chain(imu_stamps[:used], gyr[:used] - bias)
 
-    acc_first = _rotate_all(chain, acc)
+    acc_first = _rotate_all(chain, acc[:used])
     up_force = acc_first.mean(axis=0)
     gravity = float(np.linalg.norm(up_force))
     if gravity < 1e-3:
@@ -160,13 +165,21 @@ def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr
         # A quarter of the interval per independent mean: motion is correlated.
         wander = acc_first.std(axis=0).max() / 2.0 if not at_rest else 0.0
         excess = abs(gravity - _STANDARD_GRAVITY) if not at_rest else 0.0
+        if used < n:
+            # Too short to show how the force wanders: its norm does, whatever the attitude.
+            norm = np.linalg.norm(acc, axis=1)
+            wander = max(wander, math.sqrt(np.mean((norm - _STANDARD_GRAVITY) ** 2)))
         tilt_variance = min((acc_bias_sd ** 2 + wander ** 2 + excess ** 2) / gravity ** 2, 1.0)
+        if not at_rest:
+            gravity = _STANDARD_GRAVITY    # what is seen is motion, too
     up = up_force / np.linalg.norm(up_force)
 
     nan = float("nan")
     field_first, inclination, field_norm, has_heading = None, nan, nan, False
     if len(mag):
-        nearest = np.clip(np.searchsorted(imu_stamps, mag_stamps), 0, n - 1)
+        nearest = np.searchsorted(imu_stamps, mag_stamps)
+        mag = mag[:max(int(np.sum(nearest < used)), 1)]
+        nearest = np.clip(nearest[:len(mag)], 0, used - 1)
         field_first = _rotate_all(chain[nearest], np.ascontiguousarray(mag)).mean(axis=0)
         field_norm = float(np.linalg.norm(field_first))
         inclination = math.asin(np.clip(-(field_first @ up) / max(field_norm, 1e-30), -1, 1))

@@ -8,8 +8,8 @@ from numba import njit
 from imu_fusion.estimation import orientation_error_state as es
 from imu_fusion.estimation import orientation_state as st
 from imu_fusion.estimation.orientation_fusion_layout import (
-    CHANGE, COV, ENTRY, HELD, HELD_RATE, HELD_STEP, LARGEST, LIMIT, MEAN_FORCE, MEAN_RATE, N,
-    P_REST_FORCE, P_REST_RATE, P_REST_TIME, REPEATED, REPEATS, REST_SINCE, S)
+    CHANGE, COV, ENTRY, HELD, HELD_RATE, HELD_STEP, K_SIZE, LARGEST, LIMIT, MEAN_FORCE,
+    MEAN_RATE, N, P_REST_FORCE, P_REST_RATE, P_REST_TIME, REPEATED, REPEATS, REST_SINCE, S, X_SIZE)
 from imu_fusion.sensors.saturation import LIMIT_TOLERANCE
 
 REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
@@ -58,6 +58,15 @@ def find_limits(x, k, par, gyr):
         if size >= x[LIMIT + i] * (1.0 - LIMIT_TOLERANCE):
             clipped |= 1 << i
     return clipped
+
+
+def limits_of(gyr, par):
+    """Limits (3,) rad/s that are given or that rates (n, 3) show by flat tops, else infinite."""
+    x, k = np.zeros(X_SIZE), np.zeros(K_SIZE, dtype=np.int64)
+    start_limits(x, par)
+    for rates in gyr:
+        find_limits(x, k, par, rates)
+    return x[LIMIT:LIMIT + 3]
 
 
 @njit(cache=True)
