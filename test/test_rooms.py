@@ -17,7 +17,8 @@ FORBIDDEN = {"rclpy", "rosbags", "mcap", "plotly", "matplotlib", "yaml", "pathli
              "sensor_msgs", "geometry_msgs", "nav_msgs", "std_msgs", "std_srvs",
              "diagnostic_msgs"}
 # Rooms from the bottom up; a room imports only from rooms of a lower number.
-FLOOR = {"errors": 0, "parameters": 0, "compiling": 0, "geometry": 1, "samples": 1, "sensors": 2, "surfaces": 2,
+FLOOR = {"errors": 0, "parameters": 0, "compiling": 0,
+         "geometry": 1, "samples": 1, "sensors": 2, "surfaces": 2,
          "estimation": 3, "simulation": 3, "messages": 4, "parameter_file": 4,
          "surface_file": 4, "drivers": 5,
          "nodes": 5, "report": 5, "batch": 5, "graph": 5, "pipeline": 6,

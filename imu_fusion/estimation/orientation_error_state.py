@@ -60,8 +60,9 @@ TAPE_SIZE = TAPE_OP + MAX_OPS * OP_SIZE
 
 
 # States whose rows Phi, and Phi', change; those of axes at their limit come last.
-_MOVED = np.array([0, 1, 2, 15, 16, 17, 18, 19, 20, 24, 25, 26, 43, 44, 45, 46, 47, 48])
-_MOVED_BACK = np.array([*range(0, 18), 24, 25, 26, 30, 31, 32, 43, 44, 45, 46, 47, 48])
+_MOVED = np.array([*range(ATT, BIAS), *range(VEL, FIELD), *range(LOCAL, OFFSET), *range(EXCESS, N)])
+_MOVED_BACK = np.array([*range(ATT, POS), *range(LOCAL, OFFSET), *range(ACC_BIAS, LAG),
+                        *range(EXCESS, N)])
 _LIMIT_STATES = N - EXCESS
 
 

@@ -121,7 +121,8 @@ class OrientationParams(Parameters):
     surge_sd: float = param(200.0, unit="rad/s^2", low=0,
                             doc="Change of the angular acceleration (surge) of an axis beyond its "
                                 "gyroscope's limit.")
-    surge_time: float = param(0.04, unit="s", low=1e-3, doc="Time after which the slope at the limit is forgotten.")
+    surge_time: float = param(0.04, unit="s", low=1e-3,
+                              doc="Time after which the slope at the limit is forgotten.")
     max_mag_lag: float = param(0.1, unit="s", low=0, high=10,
                                doc="Magnetometer samples that arrive later are dropped.")
     max_gap: float = param(0.1, unit="s", low=1e-3,

@@ -174,7 +174,7 @@ def _correct_row(row, par, error, cov, heading_var, clipped, limits):
         if at_limit:
             row[st.ROW_COV_GYR + 4 * i] = max(cov[9 + i, 9 + i], 0.0) + cov[3 + i, 3 + i]
     st.beyond_limits(row[st.ROW_GYR:st.ROW_GYR + 3], clipped, limits)
-    cov[2, 2] += heading_var
-    st.write_cov_attitude(row, par, cov, quat_to_matrix(quat),
+    cov_world = cov[:3, :3].copy()    # other rows share cov
+    cov_world[2, 2] += heading_var
+    st.write_cov_attitude(row, par, cov_world, quat_to_matrix(quat),
                           row[st.ROW_GYR:st.ROW_GYR + 3])
-    cov[2, 2] -= heading_var

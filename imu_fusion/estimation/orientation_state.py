@@ -286,7 +286,7 @@ def beyond_limits(rate, clipped, limits):
 
 @njit(cache=True)
 def write_cov_attitude(row, par, cov_world, r, rate):
-    """Covariance of the attitude's error, imu axes, from that in world axes (3, 3) or larger.
+    """Covariance of the attitude's error, imu axes, from that in world axes (3, 3).
 
     It gets what no filter on these sensors can see: their axes in the case, and a delay of
     the rates, by which a turn of ``rate`` (3,) is late. r (3, 3): from imu to world axes.
