@@ -11,6 +11,7 @@ from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.simulation.noise_gnss import GnssErrors, gnss_errors
 
 EPOCH = 1_529_400_000 * 10**9  # 2018-06-19, the summer of the paper's measurements
+_INSIDE = 10   # values in a sampling period, of which a reading is the mean
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,24 @@ class Recording:
     mag_scale: np.ndarray
 
 
+def period_means(jump, times, period):
+    """What an inertial sensor reads: the means over its sampling periods.
+
+    The filter of a real sensor leaves these; single values of a force that steps, as it does at
+    take-off and on landing, would not add up to the change of velocity.
+
+    Args:
+        jump: the jump. times: (n,) s, middles of the periods. period: s.
+
+    Returns:
+        Rates rad/s and specific forces m/s^2 in sensor axes, (n, 3) each.
+    """
+    inside = (np.arange(_INSIDE) + 0.5) / _INSIDE - 0.5
+    motion = jump.at((times[:, None] + period * inside).ravel())
+    return [v.reshape(len(times), _INSIDE, 3).mean(axis=1)
+            for v in (jump.rate(motion), jump.specific_force(motion))]
+
+
 def record(jump, rng, phone=PhoneErrors(), gnss=GnssErrors(), gnss_rate=10.0, epoch=EPOCH,
            outages=()):
     """Record a :class:`~imu_fusion.simulation.ski_jump.SkiJump`.
@@ -70,10 +89,11 @@ def record(jump, rng, phone=PhoneErrors(), gnss=GnssErrors(), gnss_rate=10.0, ep
     biases = [sd * rng.standard_normal(3) for sd in (
         phone.gyr_bias_sd, phone.acc_bias_sd, phone.mag_bias_sd, phone.mag_scale_sd)]
     gyr_bias, acc_bias, mag_bias, mag_scale = biases
-    gyr = jump.rate(motion) + gyr_bias + phone.gyr_sd * rng.standard_normal((n, 3))
+    rate, force = period_means(jump, ticks / phone.rate, 1.0 / phone.rate)
+    gyr = rate + gyr_bias + phone.gyr_sd * rng.standard_normal((n, 3))
     if phone.gyr_range > 0.0:
         gyr = np.clip(gyr, -phone.gyr_range, phone.gyr_range)
-    acc = jump.specific_force(motion) + acc_bias + phone.acc_sd * rng.standard_normal((n, 3))
+    acc = force + acc_bias + phone.acc_sd * rng.standard_normal((n, 3))
     mag_imu = Rotation.from_quat(motion.quat_world_imu).inv().apply(field)
     mag = ((1.0 + mag_scale) * mag_imu + mag_bias + phone.mag_sd * rng.standard_normal((n, 3)))
 

@@ -6,6 +6,7 @@ The jumper pushes off above the table and sinks on landing: the sensor leaves th
 profile by a known height near take-off and touch-down.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,31 @@ from imu_fusion.surfaces.hill import Hill
 
 
 _FADE = 0.8     # s, over which the wobble begins and ends
+
+
+_FASTEST = 1.0  # Hz, of the sensor's motion over the skis
+
+
+def _sway(rng, sd):
+    """A random band-limited motion of standard deviation ``sd``: a function from times (n,) to
+    value, first and second derivative (3, n)."""
+    count = 20
+    w = 2.0 * np.pi * rng.uniform(0.0, _FASTEST, (count, 1))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (count, 1))
+    amplitude = sd * np.sqrt(2.0 / count)
+
+    def at(t):
+        sine, cosine = np.sin(w * t + phase), np.cos(w * t + phase)
+        return amplitude * np.stack([s.sum(axis=0) for s in (sine, w * cosine, -w * w * sine)])
+    return at
+
+
+def _fade(since):
+    """0 at 0, 1 from ``_FADE`` on, twice differentiable; value and derivatives (3, n)."""
+    s = np.clip(since / _FADE, 0.0, 1.0)
+    return np.stack([s ** 3 * (10.0 - 15.0 * s + 6.0 * s * s),
+                     30.0 * (s * (1.0 - s)) ** 2 / _FADE,
+                     60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / _FADE ** 2])
 
 
 def _product(f, g):
@@ -43,8 +69,9 @@ class JumpParams(Parameters):
     sink_time: float = param(0.05, doc="Time constant of the knees on landing", unit="s",
                              low=0.01)
     braking: float = param(6.0, doc="Deceleration in the out-run", unit="m/s^2", low=1)
-    wobble: float = param(0.0, doc="Amplitude of the sensor's height above the profile while the "
-                                   "skis are on it: knees, arms, snow", unit="m", low=0, high=0.2)
+    wobble: float = param(0.0, doc="Standard deviation of the sensor's random motion against the "
+                                   "skis, up and sideways, while these are on the ground: knees, "
+                                   "arms, snow", unit="m", low=0, high=0.2)
     drift: float = param(0.6, doc="Amplitude of the sideways motion after take-off", unit="m",
                          low=0)
     duration: float = param(27.0, doc="Length of the recording", unit="s", low=10)
@@ -73,6 +100,7 @@ class SkiJump:
 
     def __init__(self, hill: Hill, params: JumpParams = JumpParams()):
         self.hill, self.params = hill, params
+        self._sways = [_sway(np.random.default_rng(0), params.wobble)] * 2
         self.gravity = normal_gravity(hill.origin.latitude_deg, hill.origin.height)
         self.t_start = params.rest
         options = dict(method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.02, dense_output=True)
@@ -148,25 +176,10 @@ class SkiJump:
         return np.stack([decay * tau * (s + s * s), decay * (1.0 + s - s * s),
                          decay / tau * (s * s - 3.0 * s)])
 
-    def _wobble(self, t, begin, end):
-        """Height above the profile that comes and goes between two times, and its derivatives:
-        slower and faster than the bends of the profile."""
-        def faded(since):
-            s = np.clip(since / _FADE, 0.0, 1.0)
-            return np.stack([s ** 3 * (10.0 - 15.0 * s + 6.0 * s * s),
-                             30.0 * (s * (1.0 - s)) ** 2 / _FADE,
-                             60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / _FADE ** 2])
-
-        sines = sum(share * np.stack([np.sin(w * t + phase), w * np.cos(w * t + phase),
-                                      -w * w * np.sin(w * t + phase)])
-                    for share, w, phase in ((0.7, 2.1, 0.4), (0.3, 7.3, 1.9)))
-        before = faded(end - t) * np.array([[1.0], [-1.0], [1.0]])
-        return self.params.wobble * _product(_product(faded(t - begin), before), sines)
-
     def _on_profile(self, t, state, derivative, profile, height):
         """x, z and derivatives on a profile, at a height above it."""
         x, u = state
-        du = np.array([derivative(ti, yi)[1] for ti, yi in zip(t, state.T)])
+        du = derivative(t, state)[1]
         z, slope, curvature = profile(x)
         cosine = 1.0 / np.hypot(1.0, slope)
         vx = u * cosine
@@ -176,8 +189,9 @@ class SkiJump:
         return (np.stack([x, z - h]), np.stack([vx, slope * vx - dh]),
                 np.stack([ax, curvature * vx ** 2 + slope * ax - ddh]))
 
-    def _section(self, t):
-        """Position, velocity, acceleration (2, n) in the hill's long section, x and z."""
+    def _section(self, t, wobble):
+        """Position, velocity, acceleration (2, n) in the hill's long section, x and z, with the
+        sensor's height (3, n) against the skis."""
         hill, p = self.hill, self.params
         pos, vel, acc = np.zeros((3, 2, len(t)))
         masks = [t < self.t_start, (t >= self.t_start) & (t < self.t_takeoff),
@@ -187,18 +201,33 @@ class SkiJump:
         if m.any():
             pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
                 t[m], self._run(t[m]), self._ground(hill.in_run, p.drag_in_run, None),
-                hill.in_run, self._push(t[m]) + self._wobble(t[m], self.t_start, self.t_takeoff))
+                hill.in_run, self._push(t[m]) + wobble[:, m])
         m = masks[2]
         if m.any():
             y = self._air(t[m])
             pos[:, m], vel[:, m] = y[:2], y[2:]
-            acc[:, m] = np.array([self._flight(0.0, yi)[2:] for yi in y.T]).T
+            acc[:, m] = self._flight(t[m], y)[2:]
         m = masks[3]
         if m.any():
             pos[:, m], vel[:, m], acc[:, m] = self._on_profile(
                 t[m], self._out(t[m]), self._ground(hill.landing, p.drag, self._brake_x),
-                hill.landing, self._sink(t[m]) + self._wobble(t[m], self.t_touchdown, np.inf))
+                hill.landing, self._sink(t[m]) + wobble[:, m])
         return pos, vel, acc
+
+    def _wobble(self, t):
+        """Motion of the sensor against the skis, up and sideways, with derivatives (2, 3, n):
+        from the start to take-off and from touch-down on."""
+        ground = np.zeros((3, len(t)))
+        if self.params.wobble > 0.0:
+            end = _fade(self.t_takeoff - t) * np.array([[1.0], [-1.0], [1.0]])
+            ground = _product(_fade(t - self.t_start), end) + _fade(t - self.t_touchdown)
+        return np.stack([_product(ground, sway(t)) for sway in self._sways])
+
+    def shaken(self, rng):
+        """The same jump with another random motion of the sensor against the skis."""
+        other = copy.copy(self)
+        other._sways = [_sway(rng, self.params.wobble) for _ in range(2)]
+        return other
 
     def _angles(self, t):
         """Yaw, pitch, roll of the arm beside the direction of the jump, and their rates."""
@@ -229,10 +258,11 @@ class SkiJump:
     def at(self, t):
         """The :class:`Motion` at times t (n,) s since the beginning of the recording."""
         t = np.atleast_1d(np.asarray(t, dtype=float))
-        pos, vel, acc = self._section(t)
+        wobble, sideways = self._wobble(t)
+        pos, vel, acc = self._section(t, wobble)
         w, air = 0.5, np.maximum(t - self.t_takeoff, 0.0)
         side = self.params.drift * np.stack([1.0 - np.cos(w * air), w * np.sin(w * air),
-                                             w * w * np.cos(w * air) * (air > 0)])
+                                             w * w * np.cos(w * air) * (air > 0)]) + sideways
         to_world = [self.hill.to_world(np.stack([a[0], s, a[1]], axis=1))
                     for a, s in zip((pos, vel, acc), side)]
         (yaw, dyaw), (pitch, dpitch), (roll, droll) = self._angles(t)
