@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record
 
-
 @dataclass
 class Scores:
     """One row per seed: mean squared errors position, velocity, attitude (9), NEES (3),
-    iterations, error and standard deviation of the jump length."""
+    iterations, mean squared attitude errors in hill axes (3), mean variances of the attitude as
+    stated (3), error and standard deviation of the jump length."""
 
     rows: np.ndarray
 
@@ -28,10 +28,22 @@ class Scores:
         """Standard error of :meth:`nees` over the seeds."""
         return self.rows[:, 9:12].std(axis=0) / np.sqrt(len(self.rows))
 
+    def hill_attitude(self):
+        """RMS of the attitude error about the hill's axes (3,), deg: whatever the mount."""
+        return np.sqrt(self.rows[:, 13:16].mean(axis=0))
+
+    def stated_attitude(self):
+        """RMS (3,) of the attitude error as the covariance states it, deg, rotation vector."""
+        return np.sqrt(self.rows[:, 16:19].mean(axis=0))
+
+    def length_errors(self):
+        """Errors (n,) of the jump length and stated standard deviations (n,), m."""
+        return self.rows[:, 19], self.rows[:, 20]
+
     def cells(self):
         """Cells of a table row."""
         r, n = self.rms(), self.nees()
-        length = np.sqrt(np.mean(self.rows[:, 13] ** 2))
+        length = np.sqrt(np.mean(self.length_errors()[0] ** 2))
         return [f"{r[0]:.3f}/{r[1]:.3f}/{r[2]:.3f}", f"{r[3]:.4f}/{r[4]:.4f}/{r[5]:.4f}",
                 f"{r[6]:.2f}/{r[7]:.2f}/{r[8]:.2f}", f"{n[0]:.2f}/{n[1]:.2f}/{n[2]:.2f}",
                 "-" if np.isnan(length) else f"{length:.3f}",
@@ -48,16 +60,18 @@ def score(result, recording, hill):
     index = np.searchsorted(recording.imu.stamp, samples["stamp"])
     motion = recording.motion
     place = hill.origin.to_enu(*result.frame.to_geodetic(samples["position_world"]))
-    errors = [place - motion.position_world[index],
-              samples["vel_world"] - motion.vel_world[index],
-              (Rotation.from_quat(samples["quat_world_imu"]).inv()
-               * Rotation.from_quat(motion.quat_world_imu[index])).as_rotvec()]
+    found, true = (Rotation.from_quat(q) for q in (samples["quat_world_imu"],
+                                                   motion.quat_world_imu[index]))
+    errors = [place - motion.position_world[index], samples["vel_world"] - motion.vel_world[index],
+              (found.inv() * true).as_rotvec()]
     covs = [samples[c] for c in ("cov_position", "cov_velocity", "cov_attitude")]
     nees = [np.mean(np.einsum("ni,ni->n", e, np.linalg.solve(c, e[..., None])[..., 0]))
             for e, c in zip(errors, covs)]
     errors = [hill.to_hill(errors[0]), hill.to_hill(errors[1]), np.degrees(errors[2])]
+    turned = hill.to_hill(found.apply(errors[2]))
+    stated = np.degrees(1.0) ** 2 * np.einsum("nii->i", covs[2]) / len(samples)
     return np.concatenate([*(np.mean(e ** 2, axis=0) for e in errors), nees,
-                           [result.iterations]])
+                           [result.iterations], np.mean(turned ** 2, axis=0), stated])
 
 
 def monte_carlo(jump, seeds, params, surface, phone=PhoneErrors(), gnss=GnssErrors(),
@@ -73,7 +87,8 @@ def monte_carlo(jump, seeds, params, surface, phone=PhoneErrors(), gnss=GnssErro
     rows = []
     smoother = Smoother(params, surface)
     for seed in seeds:
-        recording = record(jump, np.random.default_rng(seed), phone, gnss, **options)
+        shaken = jump.shaken(np.random.default_rng([seed, 1]))
+        recording = record(shaken, np.random.default_rng(seed), phone, gnss, **options)
         if change is not None:
             recording = change(recording)
         result = smoother.run(recording.imu, recording.mag, recording.fix, recording.velocity,

@@ -113,12 +113,19 @@ def main():
     row("surveyed table, points 2 m apart", surface=surveyed(hill))
     row("start 6 m lower", jump=SkiJump(hill, JumpParams(start_x=-72.0)))
     row("phone turned on the body", jump=SkiJump(hill, JumpParams(mount=(2.0, -1.5, 1.0))))
+    for rate in (50.0, 400.0):
+        k = np.sqrt(rate / 100.0)
+        phone = PhoneErrors()
+        row(f"sensors at {rate:.0f} Hz, the same noise densities", params=base.replace(
+            mag_sd=k * base.mag_sd), phone=phone.replace(
+                rate=rate, **{sd: k * getattr(phone, sd) for sd in ("gyr_sd", "acc_sd", "mag_sd")}))
     south = dataclasses.replace(hill, origin=LocalFrame(-36.9, 147.3, 1600.0), azimuth_deg=40.0)
     row("southern hemisphere", jump=SkiJump(south))
 
     found = []
     for seed in SEEDS:
-        r = record(jump, np.random.default_rng(seed), gnss=late)
+        r = record(jump.shaken(np.random.default_rng([seed, 1])), np.random.default_rng(seed),
+                   gnss=late)
         result = Smoother(with_offset, hill).run(r.imu, r.mag, r.fix, r.velocity)
         found.append(result.states["gnss_time_offset"][0][0, 0])
     lines += ["", f"Delay of 100 ms: found with an RMS error of "

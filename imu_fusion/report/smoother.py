@@ -337,7 +337,7 @@ def _residuals(smoothed):
     for constraint in smoothed.surface.constraints():
         start, residual, *_ = evaluate_constraints(
             [constraint], result.samples["position_world"], result.samples["stamp"],
-            result.events, smoothed.params.event_margin)
+            result.events, smoothed.params)
         if not len(residual):
             continue
         at = np.repeat(np.arange(len(result.samples)), np.diff(start))

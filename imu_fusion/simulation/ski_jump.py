@@ -1,9 +1,10 @@
 """A ski jump with exact truth: in-run, flight, landing and run-out on a given hill.
 
-On the ground the body follows the profile; its acceleration contains the profile's
+On the ground the skis follow the profile; their acceleration contains the profile's
 curvature, so the motion is consistent to the tolerance of the integrator (1e-10).
 The jumper pushes off above the table and sinks on landing: the sensor leaves the
-profile by a known height near take-off and touch-down.
+profile by a known height near take-off and touch-down, and moves at random by some
+centimetres against the skis on the ground.
 """
 
 import copy
@@ -23,14 +24,14 @@ from imu_fusion.surfaces.hill import Hill
 _FADE = 0.8     # s, over which the wobble begins and ends
 
 
-_FASTEST = 1.0  # Hz, of the sensor's motion over the skis
+FASTEST_WOBBLE = 1.0  # Hz, of the sensor's random motion against the skis
 
 
 def _sway(rng, sd):
     """A random band-limited motion of standard deviation ``sd``: a function from times (n,) to
     value, first and second derivative (3, n)."""
     count = 20
-    w = 2.0 * np.pi * rng.uniform(0.0, _FASTEST, (count, 1))
+    w = 2.0 * np.pi * rng.uniform(0.0, FASTEST_WOBBLE, (count, 1))
     phase = rng.uniform(0.0, 2.0 * np.pi, (count, 1))
     amplitude = sd * np.sqrt(2.0 / count)
 
@@ -69,9 +70,11 @@ class JumpParams(Parameters):
     sink_time: float = param(0.05, doc="Time constant of the knees on landing", unit="s",
                              low=0.01)
     braking: float = param(6.0, doc="Deceleration in the out-run", unit="m/s^2", low=1)
-    wobble: float = param(0.0, doc="Standard deviation of the sensor's random motion against the "
-                                   "skis, up and sideways, while these are on the ground: knees, "
-                                   "arms, snow", unit="m", low=0, high=0.2)
+    # As much as a surface with sigma = 0.1 m allows for at 100 Hz, 0.1 m * sqrt(2 * 1 Hz / 100 Hz):
+    # with equal densities of white rows and of a motion below FASTEST_WOBBLE.
+    wobble: float = param(0.014, doc="Standard deviation of the sensor's random motion against "
+                                     "the skis, up and sideways, while these are on the ground: "
+                                     "knees, arms, snow", unit="m", low=0, high=0.2)
     drift: float = param(0.6, doc="Amplitude of the sideways motion after take-off", unit="m",
                          low=0)
     duration: float = param(27.0, doc="Length of the recording", unit="s", low=10)
@@ -100,7 +103,7 @@ class SkiJump:
 
     def __init__(self, hill: Hill, params: JumpParams = JumpParams()):
         self.hill, self.params = hill, params
-        self._sways = [_sway(np.random.default_rng(0), params.wobble)] * 2
+        self._sways = self._draw_sways(np.random.default_rng(0))
         self.gravity = normal_gravity(hill.origin.latitude_deg, hill.origin.height)
         self.t_start = params.rest
         options = dict(method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.02, dense_output=True)
@@ -226,8 +229,11 @@ class SkiJump:
     def shaken(self, rng):
         """The same jump with another random motion of the sensor against the skis."""
         other = copy.copy(self)
-        other._sways = [_sway(rng, self.params.wobble) for _ in range(2)]
+        other._sways = self._draw_sways(rng)
         return other
+
+    def _draw_sways(self, rng):
+        return [_sway(rng, self.params.wobble) for _ in range(2)]
 
     def _angles(self, t):
         """Yaw, pitch, roll of the arm beside the direction of the jump, and their rates."""

@@ -10,11 +10,12 @@ from benchmarks.jumps import score
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.estimation.smoother.inputs import even_stamps, spaced
+from imu_fusion.estimation.smoother.inputs import (
+    even_stamps, evaluate_constraints, spaced)
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
-from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
+from imu_fusion.simulation.ski_jump import FASTEST_WOBBLE, JumpParams, SkiJump
 from imu_fusion.surface_file import load_surface, surface_from_mapping
 
 # One seed scatters: three times the RMS that benchmarks/smoother_jump finds over seeds.
@@ -226,6 +227,25 @@ def test_other_hills_mounts_and_hemispheres(change):
     # A harder impact on the large hill: the knees give way further (up to 0.2 m).
     check(r, rec, hill, BOUNDS * 1.3)
     assert abs(r.jump.length - other.length) < 0.4
+
+
+def test_a_surface_says_as_much_per_second_at_any_rate(jump):
+    said = []
+    for rate in (50, 100, 400):
+        stamp = EPOCH + np.arange(10 * rate + 1) * (10**9 // rate)
+        place = jump.at((stamp - EPOCH) * 1e-9).position_world
+        events = JumpEvents(EPOCH + int(20e9), EPOCH + int(25e9))
+        start, _, gradient, sigma, _ = evaluate_constraints(
+            jump.hill.constraints(), place, stamp, events, SmootherParams())
+        assert start[-1] == 2 * len(stamp)  # height and lateral, in-run only
+        said.append(np.sum(1.0 / sigma ** 2))
+        if rate == 100:
+            assert np.allclose(sigma, 0.1, rtol=1e-12)  # as the paper has it
+    # A simulated sensor moves against the skis with the density of these rows.
+    allowed = 0.1 * np.sqrt(2.0 * SmootherParams().surface_interval * FASTEST_WOBBLE)
+    assert abs(jump.params.wobble / allowed - 1) < 0.02
+    # Two rows for 10 s of independent 0.1 m every 0.01 s, and half an interval at the ends.
+    assert np.allclose(said, 2 * 10 / 0.01 / 0.1 ** 2, rtol=0.003)
 
 
 def test_a_plane_holds_the_height(jump, recording):

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.simulation.jump_sensors import EPOCH, PhoneErrors, record
+from imu_fusion.simulation.jump_sensors import EPOCH, PhoneErrors, period_means, record
 from imu_fusion.simulation.noise_gnss import GnssErrors, gauss_markov, gnss_errors
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
 from imu_fusion.surface_file import load_surface
@@ -13,7 +13,8 @@ from imu_fusion.surface_file import load_surface
 
 @pytest.fixture(scope="module")
 def jump():
-    return SkiJump(load_surface("oberstdorf_hs106"))
+    """With the sensor exactly on the profile, where nothing is said."""
+    return SkiJump(load_surface("oberstdorf_hs106"), JumpParams(wobble=0.0))
 
 
 @pytest.fixture(scope="module")
@@ -58,20 +59,46 @@ def test_motion_stays_on_the_hill(jump, fine):
     assert 80 < jump.length < 110  # a plausible jump on this hill
 
 
-def test_a_wobble_stays_within_its_amplitude_and_is_motion(jump, fine):
-    shaken = SkiJump(jump.hill, JumpParams(wobble=0.03))
+def test_a_wobble_is_random_motion_against_the_skis(jump, fine):
+    shaken = SkiJump(jump.hill, JumpParams(wobble=0.03)).shaken(np.random.default_rng(1))
     motion = shaken.at(fine.time)
-    height = (motion.position_world - fine.position_world)[:, 2]
-    ground = (fine.time < jump.t_takeoff) | (fine.time > jump.t_touchdown)
-    assert 0.02 < np.abs(height[ground]).max() <= 0.03
-    assert (height[~ground] == 0.0).all()
+    off = jump.hill.to_hill(motion.position_world - fine.position_world)
+    ground = (fine.time > jump.t_start) & (fine.time < jump.t_takeoff)
+    ground |= fine.time > jump.t_touchdown
+    # Twenty sines over 15 s, faded at the ends: the spread scatters by a third.
+    assert np.all(np.abs(off[ground][:, 1:].std(axis=0) / 0.03 - 1) < 0.35)
+    assert (off[~ground] == 0.0).all() and np.abs(off[:, 0]).max() < 1e-12  # rounding
+    assert np.abs(np.corrcoef(off[ground][:, 1:].T)[0, 1]) < 0.6
+    other = shaken.shaken(np.random.default_rng(2)).at(fine.time)
+    assert np.abs(other.position_world - motion.position_world).max() > 0.03
     # The difference from the motion without it is smooth: Simpson's rule at 1 ms is exact to
     # rounding. A wrong derivative would leave centimetres.
     for derivative, value in (("vel_world", "position_world"), ("acc_world", "vel_world")):
-        rate, change = (getattr(motion, name)[:, 2] - getattr(fine, name)[:, 2]
+        rate, change = (getattr(motion, name) - getattr(fine, name)
                         for name in (derivative, value))
-        summed = cumulative_simpson(rate, x=fine.time, initial=0)
+        summed = cumulative_simpson(rate, x=fine.time, axis=0, initial=0)
         assert np.abs(summed - (change - change[0])).max() < 1e-6
+
+
+def test_samples_add_up_over_steps_of_the_force(jump):
+    # The force steps at the start, at the edge and on landing; some sample in the middle of it.
+    period, means, values = 0.01, [], []
+    for event in (jump.t_start, jump.t_takeoff, jump.t_touchdown):
+        times = round(event, 2) + period * np.arange(-5, 6)
+        motion = jump.at(times)
+        first, last = jump.at([times[0] - 0.5 * period, times[-1] + 0.5 * period]).vel_world
+        turn = Rotation.from_quat(motion.quat_world_imu)
+        fall = np.array([0.0, 0.0, -jump.gravity])
+
+        def missed(force):
+            return np.linalg.norm(first + period * (turn.apply(force) + fall).sum(axis=0) - last)
+
+        # A step of 15 m/s^2 is placed to half a millisecond, and the sensor turns by 0.01 rad
+        # in a period under that force.
+        means.append(missed(period_means(jump, times, period)[1]))
+        values.append(missed(jump.specific_force(motion)))
+    assert max(means) < 0.01
+    assert max(values) > 0.02  # what the means are for: half a period of 5.6 m/s^2 at the start
 
 
 def test_energy_of_the_in_run(jump):

@@ -235,22 +235,26 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         loss=np.concatenate([np.full(len(p[0]), p[4] ** 2) for p in parts]))
 
 
-def evaluate_constraints(constraints, position_world, stamp, events, margin):
+def evaluate_constraints(constraints, position_world, stamp, events, params):
     """Rows of all constraints on the samples where they hold.
+
+    A row of every sample says as much per second at any rate of the Imu: the standard deviation
+    of a constraint is that of rows ``surface_interval`` apart.
 
     Args:
         constraints: of the surface.
         position_world: (N, 3) m, in the frame of the surface.
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
-        margin: s around the events in which heights are free.
+        params: SmootherParams; ``event_margin`` around the events heights are free.
 
     Returns:
         start (N + 1,), residual (r,), gradient (r, 3), sigma (r,), height (r,).
     """
     pieces = []
+    share = np.sqrt(params.surface_interval * 1e9 / np.gradient(stamp - stamp[0]))
     for constraint in constraints:
-        late = np.int64(round(margin * 1e9)) if constraint.height else np.int64(0)
+        late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
         active = np.ones(len(stamp), bool)
         if constraint.phase == "in_run":
             active = stamp <= events.takeoff - late
@@ -262,7 +266,7 @@ def evaluate_constraints(constraints, position_world, stamp, events, margin):
         residual, gradient = constraint.evaluate(position_world[sample])
         keep = np.isfinite(residual)
         pieces.append((sample[keep], residual[keep], gradient[keep],
-                       np.full(keep.sum(), constraint.sigma),
+                       constraint.sigma * share[sample[keep]],
                        np.full(keep.sum(), constraint.height)))
     if not pieces:
         return (np.zeros(len(stamp) + 1, np.int64), np.empty(0), np.empty((0, 3)), np.empty(0),

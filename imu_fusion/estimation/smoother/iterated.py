@@ -113,7 +113,7 @@ class Problem:
         other.attach()
         return other
 
-    def step(self, events, margin, with_cov=False):
+    def step(self, events, with_cov=False):
         """One Gauss-Newton step; moves x.
 
         Returns:
@@ -123,7 +123,7 @@ class Problem:
         n, total = self.size, len(self.x)
         if self.constraints:
             self.rows = evaluate_constraints(self.constraints, self.x[:, 0:3],
-                                             self.imu.log.stamp, events, margin)
+                                             self.imu.log.stamp, events, self.params)
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
         boxminus(self.prior, self.x[0], delta)
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
@@ -161,7 +161,6 @@ def solve(problem, events, refine):
         events, number of steps, whether it converged, covariances, variances.
     """
     params = problem.params
-    margin = params.event_margin
     # Delays as loose as their prior would explain at first what the attitude still has wrong.
     delays = [i for i in problem.layout[[model.TIME_OFFSET, model.VELOCITY_OFFSET]] if i >= 0]
     moving = held = bool(delays)
@@ -174,7 +173,7 @@ def solve(problem, events, refine):
     while steps < params.max_iterations:
         if moving:
             problem.attach()
-        largest, covariances, variances = problem.step(events, margin, with_cov=near)
+        largest, covariances, variances = problem.step(events, with_cov=near)
         steps += 1
         near = refined and not held and largest.max() <= _NEAR * params.tolerance
         if not np.isfinite(problem.cost[-1] + largest.sum()):
@@ -203,5 +202,5 @@ def solve(problem, events, refine):
     if not len(covariances):
         if moving:
             problem.attach()
-        _, covariances, variances = problem.step(events, margin, with_cov=True)
+        _, covariances, variances = problem.step(events, with_cov=True)
     return events, steps, converged, covariances, variances

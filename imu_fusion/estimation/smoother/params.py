@@ -76,6 +76,10 @@ class SmootherParams(Parameters):
 
     body_height: float = param(0.0, doc="Height of the sensor above the surface", unit="m")
     body_height_sd: float = param(0.0, doc="Its uncertainty, as a state", unit="m", low=0.0)
+    surface_interval: float = param(
+        0.01, doc="Time after which a deviation from the surface counts as a new one: sigma is that "
+        "of rows so far apart, and what they say per second does not depend on the rate of the "
+        "Imu. Longer: slower deviations, a weaker surface", unit="s", low=1e-4, high=100.0)
     event_margin: float = param(0.3, doc="Time around take-off and touch-down in which the body "
                                 "may leave the surface", unit="s", low=0.0)
 
