@@ -229,6 +229,18 @@ def test_other_hills_mounts_and_hemispheres(change):
     assert abs(r.jump.length - other.length) < 0.4
 
 
+def test_a_delay_that_puts_every_fix_on_a_sample_converges(jump):
+    # The fixes are taken at Imu stamps, so at the true delay each may belong to either of two
+    # samples; this seed went to and fro between them.
+    r = record(jump.shaken(np.random.default_rng([2, 1])), np.random.default_rng(2),
+               gnss=GnssErrors(time_offset=0.1))
+    result = Smoother(SmootherParams(gnss_time_offset_sd=0.2), jump.hill).run(
+        r.imu, r.mag, r.fix, r.velocity)
+    delay, sd = (v[0, 0] for v in result.states["gnss_time_offset"])
+    assert result.converged and result.iterations < 15
+    assert abs(delay - 0.1) < 4 * sd
+
+
 def test_a_surface_says_as_much_per_second_at_any_rate(jump):
     said = []
     for rate in (50, 100, 400):

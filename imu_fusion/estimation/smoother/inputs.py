@@ -106,7 +106,7 @@ class Measurements:
     whiten: np.ndarray
     loss: np.ndarray
 
-    def attach(self, imu_stamp, fix_late, velocity_late):
+    def bind(self, imu_stamp, fix_late, velocity_late):
         """Bind each reading to the sample before it.
 
         Args:
@@ -114,18 +114,25 @@ class Measurements:
             fix_late, velocity_late: s by which the stamps of fixes and velocities are late.
 
         Returns:
-            order (m,) of the readings used, start (N + 1,), tau (m,) s after the sample.
+            order (m,) of the readings used, start (N + 1,) where those of each sample begin.
         """
-        late = np.zeros(3, np.int64)
-        late[FIX], late[VELOCITY] = round(fix_late * 1e9), round(velocity_late * 1e9)
-        stamp = self.stamp - late[self.kind]
+        stamp = self._taken(fix_late, velocity_late)
         inside = (stamp >= imu_stamp[0]) & (stamp <= imu_stamp[-1])
         order = np.flatnonzero(inside)
         order = order[np.lexsort((self.kind[order], stamp[order]))]
         sample = np.searchsorted(imu_stamp, stamp[order], side="right") - 1
         sample = np.minimum(sample, len(imu_stamp) - 2)
-        start = np.searchsorted(sample, np.arange(len(imu_stamp) + 1))
-        return order, start, (stamp[order] - imu_stamp[sample]) * 1e-9
+        return order, np.searchsorted(sample, np.arange(len(imu_stamp) + 1))
+
+    def since(self, imu_stamp, order, start, fix_late, velocity_late):
+        """Times (m,) s of bound readings after their samples."""
+        sample_stamp = np.repeat(imu_stamp, np.diff(start))
+        return (self._taken(fix_late, velocity_late)[order] - sample_stamp) * 1e-9
+
+    def _taken(self, fix_late, velocity_late):
+        late = np.zeros(3, np.int64)
+        late[FIX], late[VELOCITY] = round(fix_late * 1e9), round(velocity_late * 1e9)
+        return self.stamp - late[self.kind]
 
 
 def _covariances(given, default_sd, what):

@@ -59,15 +59,20 @@ class Problem:
         no_rows = np.zeros(len(self.imu.log) + 1, np.int64)
         self.rows = (no_rows, np.empty(0), np.empty((0, 3)), np.empty(0), np.empty(0, bool))
 
-    def attach(self):
-        """Bind the measurements to samples, for the delays of their stamps found so far."""
-        m = self.measurements
+    def attach(self, bind=True):
+        """Place the measurements in time, for the delays of their stamps found so far; with
+        ``bind`` anew at the sample before each, else after the sample that each is bound to,
+        unless the delays have moved by more than a step since."""
+        m, stamp = self.measurements, self.imu.log.stamp
         common, extra = (0.0 if i < 0 or self.x is None else float(self.x[0, i + 1])
                          for i in self.layout[[model.TIME_OFFSET, model.VELOCITY_OFFSET]])
-        self.order, start, tau = m.attach(self.imu.log.stamp, common, common + extra)
-        self.attached = (start, m.kind[self.order], tau, m.value[self.order],
+        late = np.array([common, common + extra])
+        if bind or np.abs(late - self.bound).max() > np.median(self.imu.steps):
+            self.order, self.start = m.bind(stamp, *late)
+            self.bound, self.innovation = late, np.zeros((len(self.order), 3))
+        tau = m.since(stamp, self.order, self.start, *late)
+        self.attached = (self.start, m.kind[self.order], tau, m.value[self.order],
                          m.whiten[self.order], m.loss[self.order])
-        self.innovation = np.zeros((len(self.order), 3))
 
     def follow(self, count=None):
         """Extended Kalman filter over the first ``count`` samples; writes x."""
@@ -170,9 +175,10 @@ def solve(problem, events, refine):
     problem.follow()
     refined, converged, steps, changed = events is None, False, 0, 0
     near, covariances, variances = False, (), ()
+    binding = moving
     while steps < params.max_iterations:
         if moving:
-            problem.attach()
+            problem.attach(binding)
         largest, covariances, variances = problem.step(events, with_cov=near)
         steps += 1
         near = refined and not held and largest.max() <= _NEAR * params.tolerance
@@ -182,11 +188,13 @@ def solve(problem, events, refine):
         change = np.inf
         if len(problem.cost) > changed + 1:
             change = abs(problem.cost[-1] - problem.cost[-2])
+        # Readings that change their sample as a delay is found put kinks into the cost, at which
+        # steps may cross to and fro.
+        if not held and len(problem.cost) > changed + 1 and problem.cost[-1] > problem.cost[-2]:
+            binding = False
         if held and change <= _SETTLED * problem.cost[-1]:
             problem.prior_sd, held, changed = prior_sd, False, len(problem.cost)
             continue
-        # Where readings change their sample as a delay is found, the step may end in a tiny
-        # cycle that no cost tells apart.
         still = change <= params.cost_tolerance
         if held or (largest.max() > params.tolerance and not still):
             continue
@@ -201,6 +209,6 @@ def solve(problem, events, refine):
     problem.prior_sd = prior_sd
     if not len(covariances):
         if moving:
-            problem.attach()
+            problem.attach(binding)
         _, covariances, variances = problem.step(events, with_cov=True)
     return events, steps, converged, covariances, variances
