@@ -24,9 +24,10 @@ def main():
     lines = [f"A jump of {jump.length:.1f} m on Oberstdorf HS106, "
              f"{jump.params.duration:.0f} s, noise of Fang's tables 4 and 5, biases drawn from "
              f"table 3; RMS over samples and seeds, {SEEDS} of them in the first line, 100 in the "
-             f"others, {PAPER_SEEDS} for the paper's method. NEES: 3 is ideal. A person wears the sensor: on the ground it moves at "
-             f"random by {100 * wobble:.1f} cm (standard deviation, below {FASTEST_WOBBLE:g} Hz, "
-             "up and sideways) against the profile, which is what rows of sigma = 0.1 m allow.",
+             f"others, {PAPER_SEEDS} for the paper's method. NEES: 3 is ideal. A person wears the "
+             f"sensor: on the ground it moves at random by {100 * wobble:.1f} cm (standard "
+             f"deviation, below {FASTEST_WOBBLE:g} Hz, up and sideways) against the profile, which "
+             "is what rows of sigma = 0.1 m allow.",
              "", HEADER]
 
     def row(name, jump=jump, seeds=100, surface=hill, params=params):
@@ -58,7 +59,8 @@ def main():
               "", "Rotation vectors are in the axes of the phone as it is mounted. About the "
               "hill's axes x/y/z the first line errs by " + three(ours.hill_attitude())
               + " deg, with no hill by " + three(free.hill_attitude()) + ". In the phone's axes, "
-              "to a thousandth: " + three(ours.rms()[6:9]) + "; the square roots of the mean stated "
+              "to a thousandth: " + three(ours.rms()[6:9])
+              + "; the square roots of the mean stated "
               "variances are " + three(ours.stated_attitude()) + ", "
               + three(square.stated_attitude()) + " with a squared loss, which is the bound for "
               "any estimator of what this sensor records.",

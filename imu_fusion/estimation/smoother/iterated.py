@@ -22,6 +22,7 @@ from imu_fusion.estimation.smoother.transition import boxminus
 _BEGINNING = 20_000_000_000   # ns, from which first attitudes are judged at least
 _HELD_SD = 1e-6               # s, of a delay that is not estimated yet
 _SETTLED = 0.01               # relative change of the cost with which delays are let go
+_CYCLE = 0.1                  # of a step's change of the cost: two steps that end so near cycle
 _NEAR = 3.0                   # tolerances: after such a step the next is likely the last
 _DELAY_SDS = 3.0              # standard deviations within which a delay of stamps is believed
 
@@ -189,9 +190,10 @@ def solve(problem, events, refine):
         if len(problem.cost) > changed + 1:
             change = abs(problem.cost[-1] - problem.cost[-2])
         # Readings that change their sample as a delay is found put kinks into the cost, at which
-        # steps may cross to and fro.
-        if not held and len(problem.cost) > changed + 1 and problem.cost[-1] > problem.cost[-2]:
-            binding = False
+        # steps may cross to and fro: two of them bring the cost back.
+        if not held and len(problem.cost) > changed + 3 and change <= _SETTLED * problem.cost[-1]:
+            back = abs(problem.cost[-1] - problem.cost[-3])
+            binding = binding and back > _CYCLE * change
         if held and change <= _SETTLED * problem.cost[-1]:
             problem.prior_sd, held, changed = prior_sd, False, len(problem.cost)
             continue
