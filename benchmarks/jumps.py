@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record
 
+
 @dataclass
 class Scores:
     """One row per seed: mean squared errors position, velocity, attitude (9), NEES (3),
