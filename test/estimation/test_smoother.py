@@ -229,6 +229,31 @@ def test_other_hills_mounts_and_hemispheres(change):
     assert abs(r.jump.length - other.length) < 0.4
 
 
+def test_a_surface_that_does_not_fit_says_so(jump, recording, result):
+    assert result.remarks() == []
+    # The sensor moves as sigma allows: the smoother follows half of it.
+    assert all(0.1 < fit.excess < 1.2 for fit in result.surface.values())
+    assert set(result.surface) == {"in_run", "in_run_lateral", "landing"}
+    logs = recording.imu, recording.mag, recording.fix, recording.velocity
+
+    neighbour = Smoother(SmootherParams(), load_surface("oberstdorf_hs137")).run(*logs)
+    assert neighbour.surface["in_run"].excess > 3.0
+    assert any("stands off the surface (in_run) by" in text for text in neighbour.remarks())
+
+    origin = jump.hill.origin
+    north = origin.latitude_deg + np.degrees(5.0 / 6.37e6)
+    shifted = dataclasses.replace(jump.hill, origin=LocalFrame(north, origin.longitude_deg,
+                                                               origin.height))
+    beside = Smoother(SmootherParams(), shifted).run(*logs)
+    # The surface holds the trajectory too far north; fixes have a standard deviation of 3 m.
+    (text,) = [text for text in beside.remarks() if "the fixes lie beside" in text]
+    north = float(text.split("by ")[1].split("/")[1])
+    assert -5.0 / 3.0 < north < -0.5
+    # Fixes that may wander by that much do not lie beside.
+    wander = SmootherParams(gnss_position_error_sd=(5.0, 5.0, 5.0), gnss_position_error_tau=300.0)
+    assert Smoother(wander, shifted).run(*logs).remarks() == []
+
+
 def test_a_delay_that_puts_every_fix_on_a_sample_converges(jump):
     # The fixes are taken at Imu stamps, so at the true delay each may belong to either of two
     # samples; this seed went to and fro between them.

@@ -69,8 +69,9 @@ def test_numbers_about_noise_are_those_of_the_simulation(sections):
         assert float(rms) == pytest.approx(float(stated), rel=0.18)
     for row in table(sections["Errors"]).rows:
         assert 0.3 < float(row[5]) < 9.0, row  # one run: correlated errors, far from 0 and 100
-    for _, count, rms, _, sigma in table(sections["Surface"]).rows:
-        assert count > 100 and float(rms) < 3 * float(sigma)
+    for _, count, rms, _, sigma, excess in table(sections["Surface"]).rows:
+        # The simulated sensor moves as sigma allows, which leaves half of it (smoother_stress).
+        assert count > 100 and float(rms) < 3 * float(sigma) and 0.1 < float(excess) < 1.2
 
 
 def test_side_view_and_mesh_lie_on_the_profile(smoothed):

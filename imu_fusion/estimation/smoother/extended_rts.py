@@ -18,6 +18,7 @@ from imu_fusion.estimation.events import detect_jump, jump_result
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors
 from imu_fusion.estimation.smoother.inputs import prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
+from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import hill_axes
 from imu_fusion.geometry.gravity import normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
@@ -107,7 +108,9 @@ class ExtendedRts:
             raise EstimationError("extended_rts diverged")
         samples = self._samples(imu, x, cov)
         jump = jump_result(hill, samples, imu, events) if hill is not None else None
-        return SmootherResult(samples, frame, {}, {}, (cost,), 1, True, events, jump)
+        constraints = () if hill is None else hill.constraints()
+        fits = surface_fits(constraints, samples, {}, events, self.params)
+        return SmootherResult(samples, frame, {}, {}, (cost,), 1, True, events, jump, fits)
 
     def _readings(self, imu, mag, fix, velocity, frame):
         """Kind -> (sample of each reading, values); readings go to the nearest sample."""

@@ -1,6 +1,6 @@
 """What the smoother returns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -14,6 +14,9 @@ SAMPLE = np.dtype([
 
 _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _MISFIT = 3.0
+_EXCESS = 1.5                # deviations from a surface; a fitting one leaves 0.5
+_BESIDE = 5.0                # standard deviations of the median innovation of fixes
+_MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
 _CAUSES = {
     "fix": "the covariances of the messages may be too small (else fix_sd), the stamps late "
            "(gnss_time_offset_sd: 0.2 finds it) or the errors wander (gnss_position_error_sd)",
@@ -32,6 +35,7 @@ class SmootherResult:
     of the rotation vector in imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
     optional states, in SI units. ``innovations``: name -> (stamp (m,), normalised
     innovations (m, 3)), white with unit variance where the model is right.
+    ``surface``: name of a constraint -> SurfaceFit.
     ``cost``: of the trajectory before each step; ``iterations`` counts the steps.
     """
 
@@ -44,6 +48,7 @@ class SmootherResult:
     converged: bool
     events: object = None
     jump: object = None
+    surface: dict = field(default_factory=dict)
 
     def summary(self):
         """One line."""
@@ -58,6 +63,15 @@ class SmootherResult:
         return {name: float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
                 for name, (_, values) in self.innovations.items() if len(values)}
 
+    def _beside(self):
+        """Medians (3,) of the normalised innovations of fixes; zeros if they may be chance."""
+        values = self.innovations.get("fix", (None, np.zeros((0, 3))))[1]
+        if not len(values):
+            return np.zeros(3)
+        middle = np.median(values, axis=0)
+        certain = np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values))
+        return middle if certain else np.zeros(3)
+
     def remarks(self):
         """What a user should know before trusting the result: texts."""
         texts = []
@@ -68,4 +82,18 @@ class SmootherResult:
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
                              f"standard deviations: {_CAUSES.get(name, _CAUSES['fix'])}")
+        beside = self._beside() if self.surface else np.zeros(1)
+        if np.abs(beside).max() > 0.0:
+            texts.append("the fixes lie beside the trajectory that the surface holds, by "
+                         + "/".join(f"{b:+.1f}" for b in beside) + " (east/north/up) of their "
+                         "standard deviations: the origin of the surface may be off, the sensor "
+                         "ride above it (body_height) or the fixes wander (gnss_position_error_sd)")
+        for name, fit in self.surface.items():
+            if fit.excess > _EXCESS:
+                texts.append(
+                    f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "
+                    f"largest {fit.largest:.2f} m), over seconds {fit.excess:.1f} times as much as "
+                    f"its sigma of {fit.sigma:g} m allows: the surface may be another than the one "
+                    "given, or the sensor move against it (a larger sigma or surface_interval, "
+                    "body_height_sd)")
         return texts

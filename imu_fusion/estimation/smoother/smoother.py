@@ -11,6 +11,7 @@ from imu_fusion.estimation.smoother.inputs import (prepare_imu, prepare_measurem
                                                    reference_frame)
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
+from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.gravity import earth_rate_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
 from imu_fusion.surfaces.hill import Hill
@@ -189,8 +190,9 @@ class Smoother:
         jump = None
         if hill is not None:
             jump = jump_result(hill, samples, log, events)
+        fits = surface_fits(problem.constraints, samples, states, events, problem.params)
         return SmootherResult(samples, frame, states, innovations, tuple(problem.cost), steps,
-                              converged, events, jump)
+                              converged, events, jump, fits)
 
 
 def _positions(problem):

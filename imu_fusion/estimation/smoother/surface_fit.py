@@ -1,0 +1,61 @@
+"""How well a smoothed trajectory keeps to its surface."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+
+_STRETCH = 1.0  # s, over which deviations are averaged: slower than what the Imu itself holds
+
+
+@dataclass(frozen=True)
+class SurfaceFit:
+    """Deviations from one constraint: ``sample`` (r,) index where it holds, ``residual`` (r,) m
+    less the body's height, their RMS ``rms`` m, ``largest`` m, ``sigma`` m of the surface.
+
+    ``excess``: RMS of the means over stretches of a second (``surface_interval`` if longer), by
+    the standard deviation that sigma gives such a mean. The smoother pulls the trajectory to
+    the surface, so a surface that fits leaves less than 1.
+    """
+
+    sample: np.ndarray
+    residual: np.ndarray
+    sigma: float
+    rms: float
+    largest: float
+    excess: float
+
+
+def surface_fits(constraints, samples, states, events, params):
+    """Name of the constraint -> :class:`SurfaceFit`, for those that hold anywhere.
+
+    Args:
+        constraints: of the surface. samples, states, events: of the SmootherResult.
+        params: SmootherParams.
+    """
+    fits = {}
+    for constraint in constraints:
+        start, residual, _, sigma, _ = evaluate_constraints(
+            [constraint], samples["position_world"], samples["stamp"], events, params)
+        if not len(residual):
+            continue
+        sample = np.repeat(np.arange(len(samples)), np.diff(start))
+        if constraint.height:
+            height = states["body_height"][0][sample, 0] if "body_height" in states \
+                else params.body_height
+            residual = residual - height
+        fits[constraint.name] = SurfaceFit(
+            sample, residual, constraint.sigma, float(np.sqrt(np.mean(residual ** 2))),
+            float(np.abs(residual).max()),
+            _excess(samples["stamp"][sample], residual, sigma, params.surface_interval))
+    return fits
+
+
+def _excess(stamp, residual, sigma, interval):
+    stretch = (stamp - stamp[0]) // round(max(_STRETCH, interval) * 1e9)
+    information = np.bincount(stretch, 1.0 / sigma ** 2)
+    means = np.bincount(stretch, residual / sigma ** 2)
+    # The last stretch is a part of one.
+    whole = information > 0.5 * information.max()
+    return float(np.sqrt(np.mean(means[whole] ** 2 / information[whole])))
