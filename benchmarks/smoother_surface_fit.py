@@ -46,12 +46,13 @@ def main():
         ("in-run 0.5 degrees flatter", built(gamma_deg=certificate["gamma_deg"] - 0.5)),
         ("landing radius 10 % larger", built(rL=1.1 * certificate["rL"])),
         ("the neighbouring large hill", load_surface("oberstdorf_hs137")))]
-    lines = [f"Simulated jumps on {NAME}, {len(SEEDS)} seeds each, smoothed with a surface that may "
-             "be another. Deviation over seconds: of the trajectory from the part of the surface that "
-             "fits worst, by what sigma allows (SurfaceFit.excess). Fixes beside: largest component "
-             "of the median innovation of fixes, in standard deviations of a fix.", "",
-             "| surface given | position x/y/z m | length m | deviation over seconds: median, largest "
-             "| fixes beside: median | runs with a remark |", "|---|---|---|---|---|---|"]
+    lines = [f"Simulated jumps on {NAME}, {len(SEEDS)} seeds each, smoothed with a surface that "
+             "may be another. Deviation over seconds: of the trajectory from the part of the "
+             "surface that fits worst, by what sigma allows (SurfaceFit.excess). Fixes beside: "
+             "largest component of the median innovation of fixes, in standard deviations of a "
+             "fix.", "",
+             "| surface given | position x/y/z m | length m | deviation over seconds: median, "
+             "largest | fixes beside: median | runs with a remark |", "|---|---|---|---|---|---|"]
     for name, ridden, surface in cases:
         smoother, rows, remarked = Smoother(SmootherParams(), surface), [], 0
         for seed in SEEDS:
