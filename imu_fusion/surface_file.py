@@ -104,7 +104,8 @@ def load_surface(name):
                               "or give the path of a YAML file")
         path = found[0]
     if not path.exists():
-        raise LayoutError(f"surface file {path} does not exist")
+        where = "" if path.is_absolute() else f" in {Path.cwd()} or beside the parameter file"
+        raise LayoutError(f"surface file {path} does not exist{where}")
     try:
         mapping = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:

@@ -191,5 +191,7 @@ def test_bad_files_are_refused_with_their_reason(tmp_path, text, message):
                                   "engelberg_hs140"])
 def test_shipped_hills_load(name):
     assert len(load_surface(name).constraints()) == 3
+    with pytest.raises(LayoutError, match="no.yaml does not exist in /.* or beside the parameter"):
+        load_surface("folder/no.yaml")
     with pytest.raises(LayoutError, match="known: .*oberstdorf_hs106"):
         load_surface("nowhere")
