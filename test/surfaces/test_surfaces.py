@@ -191,6 +191,9 @@ def test_bad_files_are_refused_with_their_reason(tmp_path, text, message):
                                   "engelberg_hs140"])
 def test_shipped_hills_load(name):
     assert len(load_surface(name).constraints()) == 3
+
+
+def test_a_missing_surface_says_where_it_was_looked_for():
     with pytest.raises(LayoutError, match="no.yaml does not exist in /.* or beside the parameter"):
         load_surface("folder/no.yaml")
     with pytest.raises(LayoutError, match="known: .*oberstdorf_hs106"):
