@@ -3,8 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# A file per process at a time: its tests share fixtures, and a ROS domain of their own.
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all bench clean
+.PHONY: demo test test-slow test-all bench clean
 
 $(READY): setup.py setup.cfg package.xml
 	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), "imu_fusion needs Python 3.11 to 3.13 (the Jazzy wheels), this is " + sys.version.split()[0] + "; try make PYTHON=python3.12"'
@@ -16,10 +18,13 @@ demo: $(READY)
 	$(BIN)/imu_fusion demo --out demo_out
 
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
+
+test-slow: $(READY)
+	$(PYTEST) -m slow
 
 test-all: $(READY)
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
