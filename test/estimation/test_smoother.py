@@ -12,6 +12,8 @@ from imu_fusion.estimation.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.inputs import (
     even_stamps, evaluate_constraints, spaced)
+from imu_fusion.estimation.smoother.result import SAMPLE
+from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
@@ -283,6 +285,28 @@ def test_a_surface_says_as_much_per_second_at_any_rate(jump):
     assert abs(jump.params.wobble / allowed - 1) < 0.02
     # Two rows for 10 s of independent 0.1 m every 0.01 s, and half an interval at the ends.
     assert np.allclose(said, 2 * 10 / 0.01 / 0.1 ** 2, rtol=0.003)
+
+
+@pytest.mark.parametrize("rate", [50, 200])
+def test_deviations_over_seconds_are_told_by_what_sigma_allows(rate):
+    plane = surface_from_mapping({"type": "plane", "slope_deg": 0, "aspect_deg": 0, "sigma": 0.1,
+                                  "origin": {"latitude": 47, "longitude": 10, "height": 500}})
+    samples = np.zeros(60 * rate, SAMPLE)
+    samples["stamp"] = EPOCH + np.arange(60 * rate) * (10**9 // rate)
+    samples["stamp"][20 * rate:] += 3600 * 10**9  # an hour without samples counts for nothing
+    # Rows of 0.1 m every 10 ms give the mean of a second 10 mm; beside that, 100 Hz of noise that
+    # means over a second do not see.
+    samples["position_world"][:, 2] = 0.015 + 0.02 * (-1.0) ** np.arange(60 * rate)
+    fit = surface_fits(plane.constraints(), samples, {}, None, SmootherParams())["plane"]
+    # Half an interval at both ends of each part.
+    assert abs(fit.excess - 1.5) < 0.02
+    assert abs(fit.rms - 0.025) < 1e-9 and abs(fit.largest - 0.035) < 1e-9
+    lifted = surface_fits(plane.constraints(), samples, {}, None,
+                          SmootherParams(body_height=0.015))["plane"]
+    assert lifted.excess < 0.05  # samples beside the gap count up to fivefold
+    slow = SmootherParams(surface_interval=0.04)  # twice as far for twice the deviation
+    assert abs(surface_fits(plane.constraints(), samples, {}, None, slow)["plane"].excess
+               - 0.75) < 0.02
 
 
 def test_a_plane_holds_the_height(jump, recording):

@@ -259,7 +259,10 @@ def evaluate_constraints(constraints, position_world, stamp, events, params):
         start (N + 1,), residual (r,), gradient (r, 3), sigma (r,), height (r,).
     """
     pieces = []
-    share = np.sqrt(params.surface_interval * 1e9 / np.gradient(stamp - stamp[0]))
+    # Samples beside a gap do not speak for it.
+    step = np.gradient(stamp - stamp[0])
+    step = np.minimum(step, max(params.max_gap * 1e9, 1.5 * np.median(step)))
+    share = np.sqrt(params.surface_interval * 1e9 / step)
     for constraint in constraints:
         late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
         active = np.ones(len(stamp), bool)

@@ -54,8 +54,9 @@ def surface_fits(constraints, samples, states, events, params):
 
 def _excess(stamp, residual, sigma, interval):
     stretch = (stamp - stamp[0]) // round(max(_STRETCH, interval) * 1e9)
+    stretch = np.unique(stretch, return_inverse=True)[1]
     information = np.bincount(stretch, 1.0 / sigma ** 2)
     means = np.bincount(stretch, residual / sigma ** 2)
-    # The last stretch is a part of one.
-    whole = information > 0.5 * information.max()
+    # The last stretch, or one with a gap, is a part of one.
+    whole = information > 0.5 * np.median(information)
     return float(np.sqrt(np.mean(means[whole] ** 2 / information[whole])))
