@@ -1,11 +1,13 @@
 """Simulated jumps, smoothed and scored against their truth (used by smoother_*)."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother import Smoother
+from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record
 
 
@@ -49,6 +51,13 @@ class Scores:
                 f"{r[6]:.2f}/{r[7]:.2f}/{r[8]:.2f}", f"{n[0]:.2f}/{n[1]:.2f}/{n[2]:.2f}",
                 "-" if np.isnan(length) else f"{length:.3f}",
                 f"{self.rows[:, 12].mean():.1f} (max {self.rows[:, 12].max():.0f})"]
+
+
+def moved(hill, north=0.0, up=0.0):
+    """The hill elsewhere, m: what the smoother is given when the origin is off."""
+    o = hill.origin
+    return dataclasses.replace(hill, origin=LocalFrame(
+        o.latitude_deg + np.degrees(north / 6.37e6), o.longitude_deg, o.height + up))
 
 
 HEADER = ("| | position x/y/z m | velocity m/s | rotation vector deg | NEES p/v/a | "

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.jumps import HEADER, monte_carlo, write
+from benchmarks.jumps import HEADER, monte_carlo, moved, write
 from imu_fusion.estimation.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
@@ -27,14 +27,6 @@ def without_imu(start, stop):
             f.name: getattr(motion, f.name)[keep] for f in dataclasses.fields(motion)})
         return dataclasses.replace(recording, imu=recording.imu[keep], motion=motion)
     return change
-
-
-def raised(hill, height):
-    """A hill whose surface lies lower than it is thought to lie by ``height``: the sensor rides
-    that much above."""
-    lower = LocalFrame(hill.origin.latitude_deg, hill.origin.longitude_deg,
-                       hill.origin.height - height)
-    return dataclasses.replace(hill, origin=lower)
 
 
 def surveyed(hill):
@@ -103,7 +95,7 @@ def main():
     row("no Imu for 0.5 s in flight", change=without_imu(start, start + 0.5))
     row("no GNSS for 1 s in flight", outages=((start, start + 1.0),))
     # The jump happens 1 m above the surface that the smoother is given.
-    low = raised(hill, 1.0)
+    low = moved(hill, up=-1.0)
     row("sensor 1 m above the surface, no state", surface=low)
     row("sensor 1 m above the surface, state", surface=low,
         params=base.replace(body_height_sd=1.0))

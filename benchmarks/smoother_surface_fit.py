@@ -6,24 +6,16 @@ import dataclasses
 import numpy as np
 import yaml
 
-from benchmarks.jumps import score, write
+from benchmarks.jumps import moved, score, write
 from imu_fusion.demos_trajectory import shared
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import record
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
 from imu_fusion.surface_file import load_surface, surface_from_mapping
 
 SEEDS = range(20)
 NAME = "oberstdorf_hs106"
-
-
-def moved(hill, north=0.0, up=0.0):
-    """The hill elsewhere, m."""
-    o = hill.origin
-    return dataclasses.replace(hill, origin=LocalFrame(
-        o.latitude_deg + np.degrees(north / 6.37e6), o.longitude_deg, o.height + up))
 
 
 def main():

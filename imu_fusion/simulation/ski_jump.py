@@ -22,8 +22,6 @@ from imu_fusion.surfaces.hill import Hill
 
 
 _FADE = 0.8     # s, over which the wobble begins and ends
-
-
 FASTEST_WOBBLE = 1.0  # Hz, of the sensor's random motion against the skis
 
 

@@ -70,7 +70,7 @@ def test_numbers_about_noise_are_those_of_the_simulation(sections):
     for row in table(sections["Errors"]).rows:
         assert 0.3 < float(row[5]) < 9.0, row  # one run: correlated errors, far from 0 and 100
     for _, count, rms, _, sigma, excess in table(sections["Surface"]).rows:
-        # The simulated sensor moves as sigma allows, which leaves half of it (smoother_surface_fit).
+        # The sensor moves as sigma allows: 1.1 is the most of 20 seeds in smoother_surface_fit.
         assert count > 100 and float(rms) < 3 * float(sigma) and 0.1 < float(excess) < 1.2
 
 

@@ -72,7 +72,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
     rotation, middle, spread = np.eye(3), np.eye(3), np.empty((3, 3))
     decay, work = np.ones(n), np.empty((n, n))
     column, column_out, defect = np.empty((n, 1)), np.empty((n, 1)), np.empty(n)
-    h, row, gain, residual = np.zeros((3, n)), np.zeros(n), np.empty(n), np.empty(3)
+    h, gain, residual = np.zeros((3, n)), np.empty(n), np.empty(3)
     entries, used = np.empty(MAX_ENTRIES), np.empty(MAX_ENTRIES, np.int64)
     lever = lever_arm.copy()
     cost, dt = 0.0, 0.0

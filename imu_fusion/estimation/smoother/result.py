@@ -14,7 +14,7 @@ SAMPLE = np.dtype([
 
 _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _MISFIT = 3.0
-_EXCESS = 1.5                # deviations from a surface; a fitting one leaves 0.5
+_EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
 _CAUSES = {
@@ -64,13 +64,14 @@ class SmootherResult:
                 for name, (_, values) in self.innovations.items() if len(values)}
 
     def _beside(self):
-        """Medians (3,) of the normalised innovations of fixes; zeros if they may be chance."""
-        values = self.innovations.get("fix", (None, np.zeros((0, 3))))[1]
-        if not len(values):
-            return np.zeros(3)
+        """Medians (3,) of the normalised innovations of fixes, None if they may be chance or no
+        surface holds the trajectory."""
+        if not self.surface or "fix" not in self.innovations:
+            return None
+        values = self.innovations["fix"][1]
         middle = np.median(values, axis=0)
         certain = np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values))
-        return middle if certain else np.zeros(3)
+        return middle if certain else None
 
     def remarks(self):
         """What a user should know before trusting the result: texts."""
@@ -82,8 +83,8 @@ class SmootherResult:
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
                              f"standard deviations: {_CAUSES.get(name, _CAUSES['fix'])}")
-        beside = self._beside() if self.surface else np.zeros(1)
-        if np.abs(beside).max() > 0.0:
+        beside = self._beside()
+        if beside is not None:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "
                          + "/".join(f"{b:+.1f}" for b in beside) + " (east/north/up) of their "
                          "standard deviations: the origin of the surface may be off, the sensor "
