@@ -11,46 +11,45 @@ from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record
 
 
+_ROW = np.dtype([("position", "f8", 3), ("velocity", "f8", 3), ("attitude", "f8", 3),
+                 ("attitude_phone", "f8", 3), ("attitude_stated", "f8", 3), ("nees", "f8", 3),
+                 ("iterations", "f8"), ("length_error", "f8"), ("length_sd", "f8")])
+
+
 @dataclass
 class Scores:
-    """One row per seed: mean squared errors position, velocity, attitude (9), NEES (3),
-    iterations, mean squared attitude errors in hill axes (3), mean variances of the attitude as
-    stated (3), error and standard deviation of the jump length."""
+    """One row (``_ROW``) per seed. Means over its samples: squared errors of position (m),
+    velocity (m/s) and attitude (rotation vector, deg) along and about the hill's axes, of the
+    attitude about the phone's axes, variances of the attitude about the hill's axes as stated;
+    NEES of position, velocity, attitude (ideal 3). Length of the jump: m."""
 
     rows: np.ndarray
 
-    def rms(self):
-        """Position m, velocity m/s, attitude deg (9,), hill axes and rotation vector."""
-        return np.sqrt(self.rows[:, :9].mean(axis=0))
+    def rms(self, name):
+        """Root mean square (3,) over samples and seeds."""
+        return np.sqrt(self.rows[name].mean(axis=0))
 
-    def nees(self):
-        """Position, velocity, attitude; ideal 3."""
-        return self.rows[:, 9:12].mean(axis=0)
+    def median_rms(self, name):
+        """Median over the seeds of their mean squares, as a root (3,)."""
+        return np.sqrt(np.median(self.rows[name], axis=0))
 
     def nees_error(self):
-        """Standard error of :meth:`nees` over the seeds."""
-        return self.rows[:, 9:12].std(axis=0) / np.sqrt(len(self.rows))
-
-    def hill_attitude(self):
-        """RMS of the attitude error about the hill's axes (3,), deg: whatever the mount."""
-        return np.sqrt(self.rows[:, 13:16].mean(axis=0))
-
-    def stated_attitude(self):
-        """RMS (3,) of the attitude error as the covariance states it, deg, rotation vector."""
-        return np.sqrt(self.rows[:, 16:19].mean(axis=0))
-
-    def length_errors(self):
-        """Errors (n,) of the jump length and stated standard deviations (n,), m."""
-        return self.rows[:, 19], self.rows[:, 20]
+        """Standard error (3,) of the mean NEES over the seeds."""
+        return self.rows["nees"].std(axis=0) / np.sqrt(len(self.rows))
 
     def cells(self):
         """Cells of a table row."""
-        r, n = self.rms(), self.nees()
-        length = np.sqrt(np.mean(self.length_errors()[0] ** 2))
-        return [f"{r[0]:.3f}/{r[1]:.3f}/{r[2]:.3f}", f"{r[3]:.4f}/{r[4]:.4f}/{r[5]:.4f}",
-                f"{r[6]:.2f}/{r[7]:.2f}/{r[8]:.2f}", f"{n[0]:.2f}/{n[1]:.2f}/{n[2]:.2f}",
+        length = np.sqrt(np.mean(self.rows["length_error"] ** 2))
+        iterations = self.rows["iterations"]
+        return [join(self.rms("position"), 3), join(self.rms("velocity"), 4),
+                join(self.rms("attitude"), 3), join(self.rows["nees"].mean(axis=0), 2),
                 "-" if np.isnan(length) else f"{length:.3f}",
-                f"{self.rows[:, 12].mean():.1f} (max {self.rows[:, 12].max():.0f})"]
+                f"{iterations.mean():.1f} (max {iterations.max():.0f})"]
+
+
+def join(values, digits):
+    """x/y/z."""
+    return "/".join(f"{v:.{digits}f}" for v in values)
 
 
 def moved(hill, north=0.0, up=0.0):
@@ -60,13 +59,13 @@ def moved(hill, north=0.0, up=0.0):
         o.latitude_deg + np.degrees(north / 6.37e6), o.longitude_deg, o.height + up))
 
 
-HEADER = ("| | position x/y/z m | velocity m/s | rotation vector deg | NEES p/v/a | "
+HEADER = ("| | position x/y/z m | velocity x/y/z m/s | rotation vector x/y/z deg | NEES p/v/a | "
           "length m | iterations |\n|---|---|---|---|---|---|---|")
 
 
-def score(result, recording, hill):
+def score(result, recording, jump):
     """One row of :class:`Scores`, over the samples that both hold."""
-    samples = result.samples
+    hill, samples = jump.hill, result.samples
     index = np.searchsorted(recording.imu.stamp, samples["stamp"])
     motion = recording.motion
     place = hill.origin.to_enu(*result.frame.to_geodetic(samples["position_world"]))
@@ -75,13 +74,24 @@ def score(result, recording, hill):
     errors = [place - motion.position_world[index], samples["vel_world"] - motion.vel_world[index],
               (found.inv() * true).as_rotvec()]
     covs = [samples[c] for c in ("cov_position", "cov_velocity", "cov_attitude")]
-    nees = [np.mean(np.einsum("ni,ni->n", e, np.linalg.solve(c, e[..., None])[..., 0]))
-            for e, c in zip(errors, covs)]
-    errors = [hill.to_hill(errors[0]), hill.to_hill(errors[1]), np.degrees(errors[2])]
-    turned = hill.to_hill(found.apply(errors[2]))
-    stated = np.degrees(1.0) ** 2 * np.einsum("nii->i", covs[2]) / len(samples)
-    return np.concatenate([*(np.mean(e ** 2, axis=0) for e in errors), nees,
-                           [result.iterations], np.mean(turned ** 2, axis=0), stated])
+    hill_imu = hill.axes @ found.as_matrix()
+    degree = np.degrees(1.0)
+    row = np.zeros((), _ROW)
+    row["nees"] = [np.mean(np.einsum("ni,ni->n", e, np.linalg.solve(c, e[..., None])[..., 0]))
+                   for e, c in zip(errors, covs)]
+    for name, error in (("position", hill.to_hill(errors[0])),
+                        ("velocity", hill.to_hill(errors[1])),
+                        ("attitude", degree * hill.to_hill(found.apply(errors[2]))),
+                        ("attitude_phone", degree * errors[2])):
+        row[name] = np.mean(error ** 2, axis=0)
+    row["attitude_stated"] = degree ** 2 * np.einsum("nij,njk,nik->i", hill_imu, covs[2],
+                                                     hill_imu) / len(samples)
+    row["iterations"] = result.iterations
+    row["length_error"] = row["length_sd"] = np.nan
+    if result.jump is not None:
+        row["length_error"] = result.jump.length - jump.length
+        row["length_sd"] = result.jump.length_sd
+    return row
 
 
 def monte_carlo(jump, seeds, params, surface, phone=PhoneErrors(), gnss=GnssErrors(),
@@ -104,10 +114,7 @@ def monte_carlo(jump, seeds, params, surface, phone=PhoneErrors(), gnss=GnssErro
         result = smoother.run(recording.imu, recording.mag, recording.fix, recording.velocity,
                               events=events,
                               initial_quat=None if initial is None else initial(recording))
-        length = np.full(2, np.nan)
-        if result.jump is not None:
-            length[:] = result.jump.length - jump.length, result.jump.length_sd
-        rows.append(np.concatenate([score(result, recording, jump.hill), length]))
+        rows.append(score(result, recording, jump))
     return Scores(np.array(rows))
 
 

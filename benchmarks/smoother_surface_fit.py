@@ -56,7 +56,8 @@ def main():
                 continue
             remarked += bool(result.remarks())
             beside = np.abs(np.median(result.innovations["fix"][1], axis=0)).max()
-            rows.append([*score(result, r, hill)[:3], (result.jump.length - ridden.length) ** 2,
+            marks = score(result, r, ridden)
+            rows.append([*marks["position"], marks["length_error"] ** 2,
                          max(fit.excess for fit in result.surface.values()), beside])
         rows = np.array(rows)
         rms = np.sqrt(rows[:, :4].mean(axis=0))

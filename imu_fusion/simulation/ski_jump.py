@@ -47,6 +47,24 @@ def _fade(since):
                      60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / _FADE ** 2])
 
 
+def _step(t, at, width):
+    """From 0 to 1 around ``at``, and its derivative."""
+    s = np.tanh((t - at) / width)
+    return 0.5 * (1.0 + s), 0.5 * (1.0 - s * s) / width
+
+
+def _turned(joints):
+    """Rotation and angular velocity (n, 3) in turned axes after (axis, angle, rate), each about
+    an axis that the ones before have turned."""
+    rotation, omega = Rotation.identity(), 0.0
+    for axis, angle, rate in joints:
+        unit = np.eye(3)[axis]
+        joint = Rotation.from_rotvec(angle[:, None] * unit)
+        rotation = rotation * joint
+        omega = joint.inv().apply(omega * np.ones((len(angle), 3))) + rate[:, None] * unit
+    return rotation, omega
+
+
 def _product(f, g):
     """Value, first and second derivative (3, n) of a product."""
     return np.stack([f[0] * g[0], f[1] * g[0] + f[0] * g[1],
@@ -76,8 +94,9 @@ class JumpParams(Parameters):
     drift: float = param(0.6, doc="Amplitude of the sideways motion after take-off", unit="m",
                          low=0)
     duration: float = param(27.0, doc="Length of the recording", unit="s", low=10)
-    mount: tuple[float, ...] = param((0.3, -0.2, 0.5), doc="Rotation vector of the sensor on "
-                                     "the body", unit="rad", length=3)
+    mount: tuple[float, ...] = param((0.0, 0.0, 0.0), doc="Rotation vector of the sensor on the "
+                                     "arm; 0 as an armband holds it, x along the right upper arm "
+                                     "to the elbow", unit="rad", length=3)
 
 
 @dataclass(frozen=True)
@@ -233,31 +252,54 @@ class SkiJump:
     def _draw_sways(self, rng):
         return [_sway(rng, self.params.wobble) for _ in range(2)]
 
-    def _angles(self, t):
-        """Yaw, pitch, roll of the arm beside the direction of the jump, and their rates."""
-        def step(at, width):
-            s = np.tanh((t - at) / width)
-            return 0.5 * (1.0 + s), 0.5 * (1.0 - s * s) / width
+    def _slope(self, t, x, vx):
+        """Inclination (downwards positive) of what the jumper is beside, and its rate: of the
+        in-run, from there over the flight to that of the landing slope, as the path has it."""
+        def inclination(profile, x, moving):
+            _, slope, curvature = profile(x)
+            return np.arctan(slope), np.where(moving, curvature * vx / (1.0 + slope ** 2), 0.0)
+
+        middle = 0.5 * (self.t_takeoff + self.t_touchdown)
+        share, change = _step(t, middle, (self.t_touchdown - self.t_takeoff) / 3.0)
+        above, above_rate = inclination(self.hill.in_run, np.minimum(x, 0.0), x < 0.0)
+        below, below_rate = inclination(self.hill.landing, np.maximum(x, self.x_touchdown),
+                                        x > self.x_touchdown)
+        return ((1.0 - share) * above + share * below,
+                (1.0 - share) * above_rate + share * below_rate + change * (below - above))
+
+    def _joints(self, t, x, vx):
+        """Angles (rad) of the right upper arm and their rates, from the world to the arm, by
+        the axis they turn about: 0 forward, 1 left, 2 up.
+
+        The trunk's inclination is told from the normal of the slope. On the bar it is upright
+        and the hands are beside the hips; in the in-run it lies along the skis with the arms
+        beside it; in flight some 40 deg to the air; for landing it rises, the arms go sideways;
+        in the out-run the arms sink and the jumper stands.
+        """
+        start, off, down = self.t_start, self.t_takeoff, self.t_touchdown
+
+        def posture(first, *changes):
+            """An angle that begins with ``first`` and changes by (change, at, width)."""
+            steps = [change * np.stack(_step(t, at, width)) for change, at, width in changes]
+            return first + sum(s[0] for s in steps), sum(s[1] for s in steps)
 
         def swing(amplitude, rate, phase):
-            return (amplitude * np.sin(rate * t + phase),
-                    amplitude * rate * np.cos(rate * t + phase))
+            return np.stack([amplitude * np.sin(rate * t + phase),
+                             amplitude * rate * np.cos(rate * t + phase)])
 
-        def total(*terms):
-            return sum(v for v, _ in terms), sum(r for _, r in terms)
-
-        def scaled(k, term):
-            return k * term[0], k * term[1]
-
-        crouch = step(self.t_start + 0.4, 0.3)
-        push = step(self.t_takeoff - 0.05, 0.12)
-        land = step(self.t_touchdown - 0.1, 0.15)
-        rise = step(self.t_touchdown + 2.5, 0.6)
-        pitch = total((1.1, 0.0 * t), scaled(0.2, crouch), scaled(-1.0, push), scaled(-0.9, land),
-                      scaled(1.2, rise), swing(0.05, 5.0, 0.3))
-        roll = total(swing(0.06, 3.1, 0.0), scaled(0.3, push), scaled(-0.4, land))
-        yaw = total(swing(0.05, 2.3, 1.0), scaled(0.15, push), scaled(0.5, rise))
-        return yaw, pitch, roll
+        stand = down + 2.5
+        turn = posture(0.0, (0.5, stand, 0.6)) + swing(0.05, 2.3, 1.0)
+        lean = (posture(-0.4, (1.83, start + 0.4, 0.3), (-0.73, off - 0.05, 0.12),
+                        (0.25, off + 0.5, 0.3), (-0.7, down - 0.15, 0.2), (-0.3, stand, 0.6))
+                + swing(0.05, 5.0, 0.3) + self._slope(t, x, vx))
+        roll = swing(0.06, 3.1, 0.0)
+        spread = posture(0.2, (-0.1, start + 0.4, 0.3), (1.3, down - 0.15, 0.15),
+                         (-1.1, stand, 0.6))
+        back = posture(0.25, (-0.1, start + 0.4, 0.3), (-0.15, down - 0.15, 0.15),
+                       (0.1, stand, 0.6))
+        heading = np.pi / 2 - np.radians(self.hill.azimuth_deg)
+        return [(2, heading + turn[0], turn[1]), (1, *lean), (0, *roll),
+                (0, -spread[0], -spread[1]), (1, back[0] + np.pi / 2, back[1])]
 
     def at(self, t):
         """The :class:`Motion` at times t (n,) s since the beginning of the recording."""
@@ -269,16 +311,9 @@ class SkiJump:
                                              w * w * np.cos(w * air) * (air > 0)]) + sideways
         to_world = [self.hill.to_world(np.stack([a[0], s, a[1]], axis=1))
                     for a, s in zip((pos, vel, acc), side)]
-        (yaw, dyaw), (pitch, dpitch), (roll, droll) = self._angles(t)
-        heading = np.pi / 2 - np.radians(self.hill.azimuth_deg)
-        body = Rotation.from_euler("ZYX", np.stack([heading + yaw, pitch, roll], axis=1))
         mount = Rotation.from_rotvec(self.params.mount)
-        # Rates of the intrinsic z-y-x angles in body axes.
-        omega_body = np.stack([
-            droll - dyaw * np.sin(pitch),
-            dpitch * np.cos(roll) + dyaw * np.cos(pitch) * np.sin(roll),
-            -dpitch * np.sin(roll) + dyaw * np.cos(pitch) * np.cos(roll)], axis=1)
-        return Motion(t, *to_world, (body * mount).as_quat(), mount.inv().apply(omega_body))
+        arm, omega_arm = _turned(self._joints(t, pos[0], vel[0]))
+        return Motion(t, *to_world, (arm * mount).as_quat(), mount.inv().apply(omega_arm))
 
     def specific_force(self, motion):
         """Specific force (n, 3) in sensor axes, m/s^2, on the turning Earth."""

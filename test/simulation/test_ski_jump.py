@@ -39,8 +39,32 @@ def test_rates_integrate_to_the_attitude(fine):
     r = Rotation.from_quat(fine.quat_world_imu)
     turn = (r[:-1].inv() * r[1:]).as_rotvec() / 0.001
     middle = 0.5 * (fine.omega_imu[1:] + fine.omega_imu[:-1])
-    # Trapezoid at 1 ms: second derivative of the rate (some 300 rad/s^3) times dt^2 / 12.
-    assert np.abs(turn - middle).max() < 1e-3
+    error = np.sort(np.abs(turn - middle).max(axis=1))
+    # Trapezoid at 1 ms: second derivative of the rate (some 400 rad/s^3) times dt^2 / 12. Where
+    # the slope under the skis ends to bend or begins to, the rate steps by up to v / R = 0.25
+    # rad/s: where the table begins, on landing, at both ends of the transition.
+    assert error[:-4].max() < 1e-4
+    assert error.max() < 0.5 * 0.25
+
+
+def test_arm_follows_the_jumper(jump):
+    """Upper arm from shoulder to elbow: forward, right, down."""
+    def arm(t):
+        motion = jump.at([t])
+        x_axis = Rotation.from_quat(motion.quat_world_imu).apply([1.0, 0.0, 0.0])
+        return jump.hill.to_hill(x_axis)[0], jump.hill.to_hill(motion.vel_world)[0]
+
+    on_bar, _ = arm(1.0)
+    assert on_bar[2] > 0.8 and on_bar[0] < 0.0              # hangs, the hands behind
+    in_run, velocity = arm(jump.t_start + 3.0)
+    assert in_run @ velocity < -0.95 * np.linalg.norm(velocity)  # back along the skis
+    air, velocity = arm(0.5 * (jump.t_takeoff + jump.t_touchdown))
+    cosine = -air @ velocity / np.linalg.norm(velocity)
+    assert np.cos(np.radians(60)) < cosine < np.cos(np.radians(20))  # back, at an angle to the air
+    telemark, _ = arm(jump.t_touchdown + 0.7)
+    assert telemark[1] > 0.9                                # the right arm to the right
+    standing, _ = arm(26.0)
+    assert standing[2] > 0.9                                # hangs
 
 
 def test_motion_stays_on_the_hill(jump, fine):
