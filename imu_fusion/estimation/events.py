@@ -19,6 +19,34 @@ class JumpEvents:
     touchdown: int
 
 
+def find_jump(imu, velocity, takeoff=None, touchdown=None):
+    """Take-off and touch-down, as given or else detected.
+
+    Args:
+        imu: ImuLog. velocity: VelocityLog or None, not needed when both are given.
+        takeoff, touchdown: s since the first Imu sample, or None.
+
+    Returns:
+        JumpEvents.
+
+    Raises:
+        EstimationError: not within the recording, not in this order, or not detected.
+    """
+    length = (imu.stamp[-1] - imu.stamp[0]) * 1e-9
+    for name, at in (("takeoff", takeoff), ("touchdown", touchdown)):
+        if at is not None and at > length:
+            raise EstimationError(f"{name} is given as {at:g} s, but the Imu samples end at "
+                                  f"{length:.1f} s")
+    found = detect_jump(imu, velocity) if None in (takeoff, touchdown) else None
+    stamps = [detected if at is None else int(imu.stamp[0]) + round(at * 1e9)
+              for at, detected in ((takeoff, found and found.takeoff),
+                                   (touchdown, found and found.touchdown))]
+    if stamps[1] <= stamps[0]:
+        raise EstimationError("the touch-down that was detected is before the take-off that was "
+                              "given, or the reverse: give both (takeoff, touchdown)")
+    return JumpEvents(*stamps)
+
+
 def detect_jump(imu, velocity):
     """Take-off and touch-down from peaks of the specific force (Fang 2020, appendix A).
 
@@ -34,14 +62,15 @@ def detect_jump(imu, velocity):
     """
     if velocity is None or len(velocity) < 2:
         raise EstimationError("take-off and touch-down cannot be detected without GNSS "
-                              "velocities: give the events")
+                              "velocities: give them (parameters takeoff and touchdown)")
     origin = imu.stamp[0]
     speed = np.interp(imu.stamp - origin, velocity.stamp - origin,
                       np.linalg.norm(velocity.vel_world, axis=1))
     force = np.linalg.norm(imu.acc, axis=1)
     fast = (speed > _MIN_SPEED) & np.isfinite(force)
     if not fast.any():
-        raise EstimationError(f"no take-off: the speed never exceeds {_MIN_SPEED:g} m/s")
+        raise EstimationError(f"no take-off: the speed never exceeds {_MIN_SPEED:g} m/s "
+                              "(parameters takeoff and touchdown give it)")
     candidates = np.where(fast, force, -np.inf)
     first = int(np.argmax(candidates))
     # (A2), with the sense of the inequality that the text describes.
@@ -50,7 +79,7 @@ def detect_jump(imu, velocity):
     second = int(np.argmax(candidates))
     if not np.isfinite(candidates[second]):
         raise EstimationError("no take-off and touch-down: only one peak of the specific force "
-                              "at speed")
+                              "at speed (parameters takeoff and touchdown give them)")
     early, late = sorted((int(imu.stamp[first]), int(imu.stamp[second])))
     return JumpEvents(early, late - int(_LEAD * 1e9))
 
@@ -158,10 +187,17 @@ def jump_result(hill, samples, imu, events):
         samples: structured array of the smoother.
         imu: ImuLog.
         events: JumpEvents.
+
+    Raises:
+        EstimationError: the touch-down is not beyond the table.
     """
     takeoff = _interpolate(events.takeoff, samples, "vel_world")
     landing = _interpolate(events.touchdown, samples, "vel_world")
     x, _, _ = hill.to_hill(_interpolate(events.touchdown, samples, "position_world"))
+    if x <= 0.0:
+        raise EstimationError(f"at touch-down the smoothed trajectory is {-x:.1f} m before the "
+                              "edge of the table: take-off and touch-down are taken wrongly (parameters "
+                              "takeoff and touchdown give them), or the hill is another one")
     slope = float(hill.landing(x)[1])
     i = int(np.searchsorted(samples["stamp"], events.touchdown))
     i = min(i, len(samples) - 1)

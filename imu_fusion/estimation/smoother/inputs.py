@@ -10,20 +10,38 @@ from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import ImuLog
 
+_NO_FIX = ("no valid GNSS fix: position cannot be estimated. Orientation alone is the job of the "
+           "orientation estimator")
+_FAR = 50e3   # m from the origin of a surface, where its plane of axes no longer describes it
 _MICRO = 1e6  # magnetic states and rows are kept in microtesla, near one in size
 
 
 def reference_frame(surface, fix):
-    """The surface's frame, or one at the first valid fix."""
-    if surface is not None:
-        return surface.origin
-    valid = np.flatnonzero(fix.status >= 0) if fix is not None else ()
+    """The surface's frame, or one at the first valid fix.
+
+    Raises:
+        EstimationError: no valid fix, or the surface is elsewhere.
+    """
+    valid = np.flatnonzero(valid_fixes(fix)) if fix is not None else ()
     if not len(valid):
-        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
-                              "alone is the job of the orientation estimator")
+        raise EstimationError(_NO_FIX)
     i = valid[0]
-    return LocalFrame(float(fix.latitude_deg[i]), float(fix.longitude_deg[i]),
-                      float(fix.height[i]))
+    first = float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
+    if surface is None:
+        return LocalFrame(*first)
+    away = float(np.linalg.norm(surface.origin.to_enu(*first)))
+    if away > _FAR:
+        raise EstimationError(
+            f"the surface's origin is {away / 1e3:.0f} km from the first fix (latitude "
+            f"{first[0]:.5f}, longitude {first[1]:.5f}): the surface is not that of this "
+            "recording, or its origin is mistyped")
+    return surface.origin
+
+
+def valid_fixes(fix):
+    """Mask (m,) of the fixes of a FixLog that say where they are."""
+    return ((fix.status >= 0) & np.isfinite(fix.latitude_deg) & np.isfinite(fix.longitude_deg)
+            & np.isfinite(fix.height))
 
 
 @dataclass(frozen=True)
@@ -215,11 +233,9 @@ def prepare_measurements(frame, mag, fix, velocity, params):
     """
     parts = []
     if fix is not None:
-        fix = fix[(fix.status >= 0) & np.isfinite(fix.latitude_deg)
-                  & np.isfinite(fix.longitude_deg) & np.isfinite(fix.height)]
+        fix = fix[valid_fixes(fix)]
     if fix is None or len(fix) == 0:
-        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
-                              "alone is the job of the orientation estimator")
+        raise EstimationError(_NO_FIX)
     eye = np.eye(3)
     fix, stamp = _gnss_readings(fix, params)
     root = _covariances(fix.cov_enu, params.fix_sd, "the fixes")
@@ -240,6 +256,24 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         kind=np.concatenate([np.full(len(p[0]), p[1]) for p in parts]),
         value=np.concatenate([p[2] for p in parts]), whiten=np.tril(whiten),
         loss=np.concatenate([np.full(len(p[0]), p[4] ** 2) for p in parts]))
+
+
+def holds(constraint, stamp, events, params):
+    """Mask (N,) of the samples at which a constraint holds: its phase of a jump, and the windows.
+
+    Args: as of :func:`evaluate_constraints`.
+    """
+    late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
+    active = np.ones(len(stamp), bool)
+    if constraint.phase == "in_run":
+        active = stamp <= events.takeoff - late
+    elif constraint.phase == "landing":
+        active = stamp >= events.touchdown + late
+    if params.surface_windows:
+        # An odd number of bounds passed: inside of a window.
+        bounds = np.round(np.array(params.surface_windows) * 1e9).astype(np.int64)
+        active = active & (np.searchsorted(bounds, stamp - stamp[0], side="right") % 2 == 1)
+    return active
 
 
 def evaluate_constraints(constraints, position_world, stamp, events, params):
@@ -264,13 +298,7 @@ def evaluate_constraints(constraints, position_world, stamp, events, params):
     step = np.minimum(step, max(params.max_gap * 1e9, 1.5 * np.median(step)))
     share = np.sqrt(params.surface_interval * 1e9 / step)
     for constraint in constraints:
-        late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
-        active = np.ones(len(stamp), bool)
-        if constraint.phase == "in_run":
-            active = stamp <= events.takeoff - late
-        elif constraint.phase == "landing":
-            active = stamp >= events.touchdown + late
-        sample = np.flatnonzero(active)
+        sample = np.flatnonzero(holds(constraint, stamp, events, params))
         if not len(sample):
             continue
         residual, gradient = constraint.evaluate(position_world[sample])

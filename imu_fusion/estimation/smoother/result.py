@@ -15,6 +15,7 @@ SAMPLE = np.dtype([
 _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _MISFIT = 3.0
 _EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
+_SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
 _CAUSES = {
@@ -90,6 +91,9 @@ class SmootherResult:
                          "standard deviations: the origin of the surface may be off, the sensor "
                          "ride above it (body_height) or the fixes wander (gnss_position_error_sd)")
         for name, fit in self.surface.items():
+            if fit.silent > _SILENT:
+                texts.append(f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of "
+                             "the samples that it should hold: its grid may end there")
             if fit.excess > _EXCESS:
                 texts.append(
                     f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "

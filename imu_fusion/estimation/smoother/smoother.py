@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.events import detect_jump, jump_result, refine_jump
+from imu_fusion.estimation.events import find_jump, jump_result, refine_jump
 from imu_fusion.estimation.smoother import initial, iterated, model
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
 from imu_fusion.estimation.smoother.inputs import (prepare_imu, prepare_measurements,
@@ -38,7 +38,7 @@ class Smoother:
 
         Args:
             imu: ImuLog. mag: MagLog or None. fix: FixLog. velocity: VelocityLog or None.
-            events: JumpEvents, or None: detected when the surface needs them.
+            events: JumpEvents, or None: found by ``find_jump`` when the surface needs them.
             initial_quat: (4,) attitude of the first sample; found from the data when None.
 
         Returns:
@@ -56,7 +56,7 @@ class Smoother:
         frame = reference_frame(surface, fix)
         constraints = surface.constraints() if surface is not None else ()
         if events is None and any(c.phase != "always" for c in constraints):
-            events = detect_jump(prepared.log, velocity)
+            events = find_jump(prepared.log, velocity, params.takeoff, params.touchdown)
         measurements = prepare_measurements(frame, mag, fix, velocity, params)
         problem = self._problem(prepared, frame, measurements, constraints, fix)
         hill = surface if isinstance(surface, Hill) and events is not None else None

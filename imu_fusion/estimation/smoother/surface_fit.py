@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.smoother.inputs import evaluate_constraints, holds
 
 _STRETCH = 1.0  # s, over which deviations are averaged: slower than what the Imu itself holds
 
@@ -17,6 +18,8 @@ class SurfaceFit:
     ``excess``: RMS of the means over stretches of a second (``surface_interval`` if longer), by
     the standard deviation that sigma gives such a mean. The smoother pulls the trajectory to
     the surface, so a surface that fits leaves less than 1.
+    ``silent``: share of the samples at which the constraint should hold, but the surface says
+    nothing (outside of an elevation grid).
     """
 
     sample: np.ndarray
@@ -25,6 +28,7 @@ class SurfaceFit:
     rms: float
     largest: float
     excess: float
+    silent: float = 0.0
 
 
 def surface_fits(constraints, samples, states, events, params):
@@ -33,6 +37,9 @@ def surface_fits(constraints, samples, states, events, params):
     Args:
         constraints: of the surface. samples, states, events: of the SmootherResult.
         params: SmootherParams.
+
+    Raises:
+        EstimationError: none holds anywhere, though there are some.
     """
     fits = {}
     for constraint in constraints:
@@ -48,7 +55,12 @@ def surface_fits(constraints, samples, states, events, params):
         fits[constraint.name] = SurfaceFit(
             sample, residual, constraint.sigma, float(np.sqrt(np.mean(residual ** 2))),
             float(np.abs(residual).max()),
-            _excess(samples["stamp"][sample], residual, sigma, params.surface_interval))
+            _excess(samples["stamp"][sample], residual, sigma, params.surface_interval),
+            1.0 - len(residual) / holds(constraint, samples["stamp"], events, params).sum())
+    if constraints and not fits:
+        raise EstimationError("the surface says nothing at any sample of this recording: an "
+                              "elevation grid must reach the trajectory (see its crs and extent), "
+                              "surface_windows must lie within the recording")
     return fits
 
 
