@@ -157,21 +157,47 @@ def refine_jump(hill, samples, imu, events):
 
 @dataclass(frozen=True)
 class JumpResult:
-    """What is reported of a jump: m, m/s, degrees, s."""
+    """What is reported of a jump: m, m/s, degrees, s; ``*_sd`` are standard deviations.
+
+    ``in_run_speed`` is None where the recording begins behind the in-run."""
 
     takeoff_stamp: int
     touchdown_stamp: int
-    in_run_speed: float
+    in_run_speed: float | None
+    in_run_speed_sd: float | None
     takeoff_speed: float
+    takeoff_speed_sd: float
     takeoff_angle_deg: float
+    takeoff_angle_sd_deg: float
     flight_time: float
+    flight_time_sd: float
     length: float
     length_sd: float
     landing_speed: float
+    landing_speed_sd: float
 
     def to_mapping(self):
         """Names and values, for JSON and CSV."""
         return asdict(self)
+
+
+def _in_air(samples, event, after):
+    """Velocity (3,) m/s and acceleration (3,) m/s^2 of the air's side of an event, where the
+    velocity has a kink: from the two samples after it or before it; and the sample between."""
+    stamp = samples["stamp"]
+    i = int(np.searchsorted(stamp, event)) if after else int(
+        np.searchsorted(stamp, event, side="right")) - 2
+    i = min(max(i, 0), len(stamp) - 2)
+    near = i if after else i + 1
+    vel = samples["vel_world"]
+    acc = (vel[i + 1] - vel[i]) / ((stamp[i + 1] - stamp[i]) * 1e-9)
+    return vel[near] + acc * ((event - stamp[near]) * 1e-9), acc, near
+
+
+def _sd(direction, cov, timing, acc):
+    """Standard deviation of the component of a velocity along a direction (3,), with
+    covariance (3, 3), at an event dated to ``timing`` s with acceleration (3,)."""
+    return float(np.hypot(np.sqrt(direction @ cov @ direction), timing * (direction @ acc)))
 
 
 def jump_result(hill, samples, imu, events):
@@ -180,7 +206,7 @@ def jump_result(hill, samples, imu, events):
     The length is that of the landing profile up to the touch-down; its standard deviation
     joins the position's along the profile and the date's times the speed. The take-off angle
     is that of the velocity at the edge, upwards positive; the in-run speed is the mean over
-    the last 10 m of the table side, as light barriers measure it.
+    the last 10 m before the edge, as light barriers measure it.
 
     Args:
         hill: Hill.
@@ -191,31 +217,47 @@ def jump_result(hill, samples, imu, events):
     Raises:
         EstimationError: the touch-down is not beyond the table.
     """
-    takeoff = _interpolate(events.takeoff, samples, "vel_world")
-    landing = _interpolate(events.touchdown, samples, "vel_world")
+    stamp, cov_velocity = samples["stamp"], samples["cov_velocity"]
+    takeoff, off_acc, edge = _in_air(samples, events.takeoff, after=True)
+    landing, down_acc, touch = _in_air(samples, events.touchdown, after=False)
     x, _, _ = hill.to_hill(_interpolate(events.touchdown, samples, "position_world"))
     if x <= 0.0:
         raise EstimationError(f"at touch-down the smoothed trajectory is {-x:.1f} m before the "
-                              "edge of the table: take-off and touch-down are taken wrongly (parameters "
-                              "takeoff and touchdown give them), or the hill is another one")
-    slope = float(hill.landing(x)[1])
-    i = int(np.searchsorted(samples["stamp"], events.touchdown))
-    i = min(i, len(samples) - 1)
-    cov = hill.axes @ samples["cov_position"][i] @ hill.axes.T
-    # On the profile dL = sqrt(1 + slope^2) dx.
-    stretch = np.hypot(1.0, slope)
+                              "edge of the table: take-off and touch-down are taken wrongly "
+                              "(parameters takeoff and touchdown give them), or the hill is "
+                              "another one")
     onset = impact_onset(imu, events.touchdown)
     timing = onset[1] if onset is not None else _LEAD
-    forward = float(hill.to_hill(landing)[0])
-    x_hill = hill.to_hill(samples["position_world"])[:, 0]
-    table = (samples["stamp"] < events.takeoff) & (x_hill > -10.0)
+
+    # On the profile dL = sqrt(1 + slope^2) dx.
+    slope = float(hill.landing(x)[1])
+    forward = hill.axes[0]
+    cov_x = np.einsum("i,nij,j->n", forward, samples["cov_position"], forward)
+    length_sd = np.hypot(1.0, slope) * np.hypot(np.sqrt(cov_x[touch]),
+                                                timing * (forward @ landing))
+    edge_timing = np.sqrt(cov_x[edge]) / (forward @ takeoff)
     speed = np.linalg.norm(samples["vel_world"], axis=1)
+    takeoff_speed, landing_speed = np.linalg.norm(takeoff), np.linalg.norm(landing)
+    horizontal = np.hypot(*takeoff[:2])
+    raised = np.array([*(-takeoff[2] * takeoff[:2] / horizontal), horizontal])
+    table = np.flatnonzero((stamp < events.takeoff)
+                           & (hill.to_hill(samples["position_world"])[:, 0] > -10.0))
+    in_run = in_run_sd = None
+    if len(table):
+        # Errors of the velocity hardly change over 0.4 s.
+        middle = table[len(table) // 2]
+        in_run = float(speed[table].mean())
+        in_run_sd = _sd(samples["vel_world"][middle] / speed[middle], cov_velocity[middle],
+                        0.0, np.zeros(3))
     return JumpResult(
         takeoff_stamp=events.takeoff, touchdown_stamp=events.touchdown,
-        in_run_speed=float(speed[table].mean()) if table.any() else float("nan"),
-        takeoff_speed=float(np.linalg.norm(takeoff)),
-        takeoff_angle_deg=float(np.degrees(np.arctan2(takeoff[2], np.hypot(*takeoff[:2])))),
+        in_run_speed=in_run, in_run_speed_sd=in_run_sd, takeoff_speed=float(takeoff_speed),
+        takeoff_speed_sd=_sd(takeoff / takeoff_speed, cov_velocity[edge], edge_timing, off_acc),
+        takeoff_angle_deg=float(np.degrees(np.arctan2(takeoff[2], horizontal))),
+        takeoff_angle_sd_deg=float(np.degrees(
+            _sd(raised / takeoff_speed ** 2, cov_velocity[edge], edge_timing, off_acc))),
         flight_time=(events.touchdown - events.takeoff) * 1e-9,
-        length=float(hill.jump_length(x)),
-        length_sd=float(stretch * np.sqrt(cov[0, 0] + (timing * forward) ** 2)),
-        landing_speed=float(np.linalg.norm(landing)))
+        flight_time_sd=float(np.hypot(timing, edge_timing)),
+        length=float(hill.jump_length(x)), length_sd=float(length_sd),
+        landing_speed=float(landing_speed), landing_speed_sd=_sd(
+            landing / landing_speed, cov_velocity[touch], timing, down_acc))

@@ -46,12 +46,12 @@ def valid_fixes(fix):
 
 @dataclass(frozen=True)
 class ImuInput:
-    """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped_gyr`` (N,) the
-    rates out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
+    """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped`` (N, 6) the rates
+    and forces out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
 
     log: ImuLog
     recorded: np.ndarray
-    clipped_gyr: np.ndarray
+    clipped: np.ndarray
     noise: np.ndarray
 
     @property
@@ -98,8 +98,7 @@ def prepare_imu(imu, params):
         columns = [np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v[:, i])
                                     for i in range(3)]) for v in (imu.gyr, imu.acc)]
         imu = ImuLog(stamp=stamp[order], gyr=columns[0], acc=columns[1], frame_id=imu.frame_id)
-    sides = []
-    clipped_gyr = np.zeros(len(imu), bool)
+    sides, clipped = [], []
     for values, limit, density, unknown in (
             (imu.gyr, params.gyro_range, params.gyro_noise_density, params.unknown_gyro_density),
             (imu.acc, params.acc_range, params.acc_noise_density, params.unknown_acc_density)):
@@ -107,11 +106,11 @@ def prepare_imu(imu, params):
         if limit > 0.0:
             # One part in a thousand below the limit: rounding of logged full-scale values.
             lost |= np.abs(values) >= 0.999 * limit
-            if values is imu.gyr:
-                clipped_gyr = lost.any(axis=1) & recorded
+        clipped.append(lost & recorded[:, None])
         either = lost[1:] | lost[:-1]
         sides.append(np.where(either, unknown, density) ** 2)
-    return ImuInput(imu, recorded, clipped_gyr, np.concatenate(sides, axis=1))
+    return ImuInput(imu, recorded, np.concatenate(clipped, axis=1),
+                    np.concatenate(sides, axis=1))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ SAMPLE = np.dtype([
     ("stamp", "i8"), ("position_world", "f8", 3), ("vel_world", "f8", 3),
     ("quat_world_imu", "f8", 4), ("acc", "f8", 3), ("gyr", "f8", 3), ("gyr_bias", "f8", 3),
     ("acc_bias", "f8", 3), ("cov_position", "f8", (3, 3)), ("cov_velocity", "f8", (3, 3)),
-    ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3)])
+    ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3),
+    ("gyr_sd", "f8", 3), ("acc_sd", "f8", 3)])
 
 _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _MISFIT = 3.0
@@ -27,13 +28,25 @@ _CAUSES = {
     "mag": "the field may be disturbed, or mag_sd, mag_bias_sd and mag_scale_sd too small"}
 
 
+def reading_variances(stamp, params):
+    """Variances (2,) of the noise in one sample of rate and of force, of the stated densities.
+
+    Args:
+        stamp: (n,) ns. params: SmootherParams.
+    """
+    rate = 1e9 / np.median(np.diff(stamp))
+    return rate * np.square([params.gyro_noise_density, params.acc_noise_density])
+
+
 @dataclass(frozen=True)
 class SmootherResult:
     """What the smoother found.
 
     ``samples``: structured array (:data:`SAMPLE`), one per usable Imu sample; ``acc`` and
-    ``gyr`` are corrected of the estimated errors, in the imu frame; ``cov_attitude`` is that
-    of the rotation vector in imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
+    ``gyr`` are corrected of the estimated errors, in the imu frame, and still carry the noise
+    of their sample: ``acc_sd`` and ``gyr_sd`` are of all of it. Where a reading was clipped,
+    they are those of the smoothed motion. ``cov_attitude`` is that of the rotation vector in
+    imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
     optional states, in SI units. ``innovations``: name -> (stamp (m,), normalised
     innovations (m, 3)), white with unit variance where the model is right.
     ``surface``: name of a constraint -> SurfaceFit.
