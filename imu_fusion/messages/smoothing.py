@@ -312,6 +312,7 @@ def run(logs, report, params):
         report.skipped = str(error)
         return
     outcome = Outcome.of(result, logs[IMU_TOPIC][0].frame_id)
-    report.summary, report.results = outcome.summary, outcome.numbers
+    report.summary = outcome.summary
+    report.results = {**outcome.numbers, "remarks": outcome.remarks}
     report.remarks = outcome.remarks
     yield from messages(result.samples, outcome, params.path_rate)
