@@ -14,12 +14,12 @@ from rosbags.typesys.stores.ros2_jazzy import (
     diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
     diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
     diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, MessageError, SampleError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.geometry.rotation import quat_to_matrix, skew
 from imu_fusion.messages.bag import TYPES
-from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message, imu_message
+from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameters import param
@@ -42,7 +42,7 @@ OUTPUTS = {ODOMETRY_TOPIC: ODOMETRY.msgtype, SMOOTHED_IMU_TOPIC: IMU.msgtype,
 PER_SAMPLE = (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, SMOOTHED_FIX_TOPIC)
 
 
-_PLACES = 1000  # samples whose geodetic positions are computed at once
+_SLICE = 1000  # samples whose messages are made at once
 
 
 @dataclass(frozen=True)
@@ -241,38 +241,50 @@ def messages(samples, outcome, path_rate):
         samples: structured array of a SmootherResult. outcome: Outcome. path_rate: Hz.
     """
     frame_id = outcome.frame_id
-    values = np.zeros(ODOMETRY.size)
-    for i, row in enumerate(samples):
-        if i % _PLACES == 0:
-            places = np.column_stack(
-                outcome.frame.to_geodetic(samples["position_world"][i:i + _PLACES]))
-        stamp = int(row["stamp"])
-        rotation = quat_to_matrix(row["quat_world_imu"])
-        cov_attitude = rotation @ row["cov_attitude"] @ rotation.T
-        pose_cov, twist_cov = np.zeros((6, 6)), np.zeros((6, 6))
-        pose_cov[:3, :3], pose_cov[3:, 3:] = row["cov_position"], cov_attitude
-        vel_imu = rotation.T @ row["vel_world"]
-        # A wrong attitude turns the velocity, too; how the two errors go together is not kept.
-        turned = skew(vel_imu)
-        twist_cov[:3, :3] = (rotation.T @ row["cov_velocity"] @ rotation
-                             + turned @ row["cov_attitude"] @ turned.T)
-        twist_cov[3:, 3:] = np.diag(row["gyr_sd"] ** 2)
-        values[ODOMETRY["position"]] = row["position_world"]
-        values[ODOMETRY["orientation"]] = row["quat_world_imu"]
-        values[ODOMETRY["pose_covariance"]] = pose_cov.ravel()
-        values[ODOMETRY["linear"]] = vel_imu
-        values[ODOMETRY["angular"]] = row["gyr"]
-        values[ODOMETRY["twist_covariance"]] = twist_cov.ravel()
-        yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", values, frame_id)
-        yield SMOOTHED_IMU_TOPIC, stamp, imu_message(
-            stamp, frame_id, row["gyr"], row["acc"], row["quat_world_imu"], cov_attitude,
-            np.diag(row["gyr_sd"] ** 2), np.diag(row["acc_sd"] ** 2))
-        yield SMOOTHED_FIX_TOPIC, stamp, fix_message(
-            stamp, frame_id, *places[i % _PLACES], row["cov_position"])
+    for first in range(0, len(samples), _SLICE):
+        rows = samples[first:first + _SLICE]
+        for stamp, odometry, imu, fix in zip(rows["stamp"], *_values(rows, outcome.frame)):
+            stamp = int(stamp)
+            yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", odometry, frame_id)
+            yield SMOOTHED_IMU_TOPIC, stamp, IMU.encode(stamp, frame_id, imu)
+            yield SMOOTHED_FIX_TOPIC, stamp, fix_message(stamp, frame_id, *fix[:3], fix[3:])
     if len(samples):
         last = int(samples["stamp"][-1])
         yield PATH_TOPIC, last, _path(samples, path_rate)
         yield RESULTS_TOPIC, last, outcome.message(last)
+
+
+def _values(rows, frame):
+    """Values of the messages of samples: Odometry and Imu in the order of their layouts, latitude,
+    longitude, height and covariance; (n, size) each."""
+    n = len(rows)
+    rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    back = rotation.transpose(0, 2, 1)
+    vel_imu = np.einsum("nij,nj->ni", back, rows["vel_world"])
+    cov_attitude = rotation @ rows["cov_attitude"] @ back
+    # A wrong attitude turns the velocity, too; how the two errors go together is not kept.
+    turned = np.cross(np.eye(3), vel_imu[:, None, :])
+    pose, twist, imu = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, IMU.size))
+    pose[:, :3, :3], pose[:, 3:, 3:] = rows["cov_position"], cov_attitude
+    twist[:, :3, :3] = (back @ rows["cov_velocity"] @ rotation
+                        + turned @ rows["cov_attitude"] @ turned.transpose(0, 2, 1))
+    axes = np.arange(3)
+    twist[:, axes + 3, axes + 3] = rows["gyr_sd"] ** 2
+    odometry = np.zeros((n, ODOMETRY.size))
+    for field, value in (("position", rows["position_world"]),
+                         ("orientation", rows["quat_world_imu"]), ("linear", vel_imu),
+                         ("pose_covariance", pose.reshape(n, 36)), ("angular", rows["gyr"]),
+                         ("twist_covariance", twist.reshape(n, 36))):
+        odometry[:, ODOMETRY[field]] = value
+    for field, value in (("orientation", rows["quat_world_imu"]),
+                         ("orientation_covariance", cov_attitude.reshape(n, 9)),
+                         ("angular_velocity", rows["gyr"]), ("linear_acceleration", rows["acc"])):
+        imu[:, IMU[field]] = value
+    for field, name in (("angular_velocity_covariance", "gyr_sd"),
+                        ("linear_acceleration_covariance", "acc_sd")):
+        imu[:, IMU[field]][:, ::4] = rows[name] ** 2
+    place = np.column_stack(frame.to_geodetic(rows["position_world"]))
+    return odometry, imu, np.column_stack([place, rows["cov_position"].reshape(n, 9)])
 
 
 def _path(samples, rate):

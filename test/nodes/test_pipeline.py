@@ -9,6 +9,7 @@ from imu_fusion.errors import EstimationError, LayoutError, TopicError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
+from imu_fusion.messages.smoothing import RESULTS_TOPIC, results_value
 from imu_fusion.nodes.pipeline import Pipeline
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
@@ -23,7 +24,9 @@ def fields(path, topics):
         found = {topic: [] for topic in topics}
         for topic, msgtype, _, cdr in reader.messages(topics):
             layout = LAYOUTS.get(msgtype)
-            if layout is None:
+            if topic == f"/{RESULTS_TOPIC}":
+                found[topic].append(results_value(cdr))
+            elif layout is None:
                 found[topic].append(bytes(cdr))
             else:
                 stamp, frame_id, values = layout.decode(cdr)

@@ -13,7 +13,8 @@ from imu_fusion.errors import EstimationError, LayoutError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
-from imu_fusion.messages.smoothing import OUTPUTS, Collection, newest_epoch
+from imu_fusion.messages.smoothing import (
+    OUTPUTS, RESULTS_TOPIC, Collection, newest_epoch, results_value)
 from imu_fusion.nodes.flow import END, FlowSink, reliable_qos
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
@@ -45,6 +46,8 @@ def write(path, count=600):
 
 
 def fields(topic, cdr):
+    if topic == f"/{RESULTS_TOPIC}":
+        return results_value(cdr)
     layout = LAYOUTS.get(OUTPUTS[topic.lstrip("/")])
     if layout is None:
         return bytes(cdr)  # a Path has no padding: strings end on the boundary of stamps
