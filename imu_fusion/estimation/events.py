@@ -52,7 +52,8 @@ def detect_jump(imu, velocity):
 
     Args:
         imu: ImuLog.
-        velocity: VelocityLog; its speed limits the search to the fast part.
+        velocity: VelocityLog; its speed limits the search to the fast part. What is not finite
+            is left out.
 
     Returns:
         JumpEvents.
@@ -60,6 +61,8 @@ def detect_jump(imu, velocity):
     Raises:
         EstimationError: no fast part, or no two peaks.
     """
+    if velocity is not None:
+        velocity = velocity[np.isfinite(velocity.vel_world).all(axis=1)]
     if velocity is None or len(velocity) < 2:
         raise EstimationError("take-off and touch-down cannot be detected without GNSS "
                               "velocities: give them (parameters takeoff and touchdown)")

@@ -100,7 +100,8 @@ def smoother_sections(smoothed, reference=None):
 def smoother_numbers(result):
     """The key numbers of a result: a tuple of Number."""
     sd = np.sqrt(np.median(np.trace(result.samples["cov_position"], axis1=1, axis2=2)))
-    state = "converged" if result.converged else "NOT CONVERGED"
+    state = {None: "single pass", True: "converged",
+             False: "NOT CONVERGED"}[result.converged]
     items = [Number("Iterations", str(result.iterations), state),
              Number("Position σ", f"{number(sd, 2)} m", "3D, median")]
     if result.jump is not None:
@@ -310,8 +311,6 @@ def _before_after(smoothed):
 
 def _innovations(smoothed):
     """Normalised innovations with their bounds, and whether they are white."""
-    if not smoothed.result.innovations:
-        return Section("Innovations", (Text(f"The method {smoothed.params.method} gives none."),))
     rows, panels = [], []
     for name, (stamp, values) in smoothed.result.innovations.items():
         what, parts = _INNOVATIONS[name]

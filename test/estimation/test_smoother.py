@@ -486,17 +486,3 @@ def test_a_surface_elsewhere_is_refused(jump, recording):
     with pytest.raises(EstimationError, match="origin is 1[0-9][0-9] km from the first fix"):
         Smoother(SmootherParams(), away).run(recording.imu, recording.mag, recording.fix,
                                              recording.velocity)
-
-
-def test_baseline_of_the_paper(jump):
-    # A good first attitude (no biases of the magnetometer): a single pass does well.
-    easy = record(jump, np.random.default_rng(1),
-                  PhoneErrors(rate=50.0, mag_bias_sd=0, mag_scale_sd=0, mag_sd=1e-6))
-    r = Smoother(SmootherParams(method="extended_rts"), jump.hill).run(
-        easy.imu, easy.mag, easy.fix, easy.velocity)
-    row = rms(score(r, easy, jump))
-    assert np.all(row < BOUNDS * 3), row
-    assert abs(r.jump.length - jump.length) < 1.5
-    with pytest.raises(EstimationError, match="magnetometer"):
-        Smoother(SmootherParams(method="extended_rts")).run(easy.imu, None, easy.fix,
-                                                            easy.velocity)

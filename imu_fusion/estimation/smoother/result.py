@@ -15,6 +15,9 @@ SAMPLE = np.dtype([
 
 _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _MISFIT = 3.0
+# RMS of a single pass. Simulated jumps: 1.0 to 1.1 where the attitude is within 1 deg of the truth,
+# 1.7 where it is 6 deg off.
+_SINGLE_PASS = 1.3
 _EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
 _SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
@@ -50,7 +53,8 @@ class SmootherResult:
     optional states, in SI units. ``innovations``: name -> (stamp (m,), normalised
     innovations (m, 3)), white with unit variance where the model is right.
     ``surface``: name of a constraint -> SurfaceFit.
-    ``cost``: of the trajectory before each step; ``iterations`` counts the steps.
+    ``cost``: of the trajectory before each step; ``iterations`` counts the steps;
+    ``converged``: None where the method passes once and so cannot tell.
     """
 
     samples: np.ndarray
@@ -59,7 +63,7 @@ class SmootherResult:
     innovations: dict
     cost: tuple
     iterations: int
-    converged: bool
+    converged: bool | None
     events: object = None
     jump: object = None
     surface: dict = field(default_factory=dict)
@@ -68,14 +72,28 @@ class SmootherResult:
         """One line."""
         jump = f", jump length {self.jump.length:.1f} m" if self.jump else ""
         state = "converged" if self.converged else "did not converge"
-        return (f"{len(self.samples)} samples, {self.iterations} iterations ({state}), "
-                f"cost {self.cost[-1]:.6g}{jump}")
+        steps = "a single pass" if self.converged is None else \
+            f"{self.iterations} iterations ({state})"
+        return f"{len(self.samples)} samples, {steps}, cost {self.cost[-1]:.6g}{jump}"
 
     def misfit(self):
         """Name -> typical size of its innovations, in standard deviations: 1 where the model is
         right. By the median, so that outliers do not count."""
         return {name: float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
                 for name, (_, values) in self.innovations.items() if len(values)}
+
+    def _astray(self):
+        """Name and RMS of the largest innovations of a single pass, None where all fit.
+
+        By the RMS: no iteration mends a wrong first attitude, and what it costs the first
+        seconds is lost in a median.
+        """
+        if self.converged is not None:
+            return None
+        rms = {name: float(np.sqrt(np.mean(values ** 2)))
+               for name, (_, values) in self.innovations.items() if len(values)}
+        name = max(rms, key=rms.get, default=None)
+        return (name, rms[name]) if name and rms[name] > _SINGLE_PASS else None
 
     def _beside(self):
         """Medians (3,) of the normalised innovations of fixes, None if they may be chance or no
@@ -90,9 +108,15 @@ class SmootherResult:
     def remarks(self):
         """What a user should know before trusting the result: texts."""
         texts = []
-        if not self.converged:
+        if self.converged is False:
             texts.append(f"the smoother did not converge in {self.iterations} iterations: take its "
                          "result as provisional")
+        astray = self._astray()
+        if astray is not None:
+            texts.append(f"the {astray[0]} innovations of the single pass have an RMS of "
+                         f"{astray[1]:.1f} standard deviations: it may have begun with a wrong "
+                         "attitude and kept to it, or the noise is another; method: iterated "
+                         "starts from several and repeats")
         for name, size in self.misfit().items():
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "

@@ -51,7 +51,8 @@ class Smoother:
         """
         params, surface = self.params, self.surface
         if params.method == "extended_rts":
-            return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events)
+            return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events,
+                                                    initial_quat)
         prepared = prepare_imu(imu, params)
         frame = reference_frame(surface, fix)
         constraints = surface.constraints() if surface is not None else ()
