@@ -199,7 +199,7 @@ class Outcome:
     def of(cls, result, frame_id):
         """Of a SmootherResult."""
         numbers = {"samples": len(result.samples), "iterations": result.iterations,
-                   "converged": bool(result.converged), "cost": float(result.cost[-1]),
+                   "converged": result.converged, "cost": float(result.cost[-1]),
                    "misfit": result.misfit()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
