@@ -62,8 +62,8 @@ class SmootherNodeParams(EstimatorNodeParams):
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
                                     "taken, and smoothing is refused until smoother/clear. Imu "
-                                    "and magnetometer at 100 Hz take 32 MB an hour, smoothing "
-                                    "them ten times as much.")
+                                    "and magnetometer at 100 Hz take 32 MB an hour; smoothing "
+                                    "takes more (docs/smoother.md).")
 
 
 class Collection:
