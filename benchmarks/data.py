@@ -7,7 +7,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.orientation_error import split_angles
+from imu_fusion.messages.smoothing import SmoothingParams
+from imu_fusion.parameter_file import parameters_for
 from imu_fusion.samples.logs import ImuLog, MagLog
+
+
+def config(name, **changes):
+    """SmoothingParams of a file in config/, with changes."""
+    file = Path(__file__).resolve().parents[1] / "config" / f"{name}.yaml"
+    return parameters_for((SmoothingParams,), "smoother", file)[0].replace(**changes)
 
 
 def data_path(name):

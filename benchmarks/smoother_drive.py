@@ -7,9 +7,9 @@ paper's table 5 added; the error is against the RTK fixes.
 
 import numpy as np
 
-from benchmarks.data import data_path
+from benchmarks.data import config, data_path
 from benchmarks.jumps import write
-from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
 
@@ -18,10 +18,7 @@ from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
 # 0.2-0.6 m/s^2), as densities at 100 Hz about 3e-3 and 3e-2; the biases drift slowly. The
 # receiver differences positions for its velocity, so this comes late by half a period
 # (0.125 s, found by correlation and by the state).
-PARAMS = SmootherParams(
-    gyro_noise_density=3e-3, acc_noise_density=3e-2, gyro_bias_sd=0.02, acc_bias_sd=1.0,
-    gyro_bias_walk=1e-5, acc_bias_walk=1e-3, velocity_sd=(0.1, 0.1, 0.1),
-    gnss_time_offset_sd=0.2, velocity_time_offset_sd=0.2, gnss_lever_arm=(0.0, 0.05, 0.0))
+PARAMS = config("drive_0708")
 LENGTH, COUNT = 15.0, 11
 SEEDS = 20
 

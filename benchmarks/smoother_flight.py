@@ -10,30 +10,20 @@ import numpy as np
 from scipy.signal import coherence, csd, welch
 from scipy.spatial.transform import Rotation, Slerp
 
-from benchmarks.data import data_path
+from benchmarks.data import config, data_path
 from benchmarks.jumps import write
-from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.estimation.smoother.inputs import even_stamps
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 
-# Vibration of a propeller, aliased at 136 Hz; autopilots of that time delayed their GNSS by
-# some 0.2 s. The magnetometer sits beside the motor's currents: its norm swings between 30 and
-# 55 uT. An error of 20 uT that 25 samples in a row repeat counts as 100 uT in each.
-WHITE = SmootherParams(
-    gyro_noise_density=1e-2, acc_noise_density=0.2, gyro_bias_sd=0.2, acc_bias_sd=1.0,
-    fix_sd=(1.0, 1.0, 1.5), velocity_sd=(0.3, 0.3, 0.5), gnss_time_offset_sd=0.3, mag_sd=100e-6)
-# The logger stamps fixes as they arrive, up to 57 ms off even steps of 0.2 s (0.7 m at 13 m/s).
-# Receivers filter: from fix to fix a position repeats to centimetres while it wanders by metres
-# over minutes, and errors of the velocity last half a second.
-WANDERING = WHITE.replace(
-    gyro_noise_density=2e-2, acc_noise_density=0.3, gnss_even_stamps=True,
-    fix_sd=(0.02, 0.02, 0.03), gnss_position_error_sd=(1.0, 1.0, 1.5),
-    gnss_position_error_tau=60.0, velocity_sd=(0.05, 0.05, 0.02),
-    gnss_velocity_error_sd=(0.4, 0.4, 0.6), gnss_velocity_error_tau=0.5)
-# The filter of the receiver: neighbours repeat each other's errors, every second fix does not,
-# nor does its height repeat as closely.
-PARAMS = WANDERING.replace(gnss_min_interval=0.35, fix_sd=(0.02, 0.02, 0.06))
+PARAMS = config("px4_plane")
+# Neighbouring fixes repeat each other's errors, and their height repeats more closely.
+WANDERING = PARAMS.replace(gnss_min_interval=0.0, fix_sd=(0.02, 0.02, 0.03))
+WHITE = PARAMS.replace(
+    gnss_min_interval=0.0, gnss_even_stamps=False, gyro_noise_density=1e-2, acc_noise_density=0.2,
+    fix_sd=(1.0, 1.0, 1.5), gnss_position_error_sd=(0.0, 0.0, 0.0), velocity_sd=(0.3, 0.3, 0.5),
+    gnss_velocity_error_sd=(0.0, 0.0, 0.0))
 # The plane is thrown after some 15 s.
 LAGS, FLYING = 10, 20.0
 

@@ -6,21 +6,19 @@ fixes. The Imu runs at 30 Hz and the bag has no magnetometer and no GNSS velocit
 
 import numpy as np
 
-from benchmarks.data import data_path
+from benchmarks.data import config, data_path
 from benchmarks.jumps import write
 from imu_fusion.errors import ImuFusionError
-from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.messages.bag import open_bag
 from imu_fusion.messages.convert import read_log
-from imu_fusion.surface_file import surface_from_mapping
+from imu_fusion.surface_file import load_surface
 
-BASE = SmootherParams(gyro_noise_density=5e-3, acc_noise_density=0.1, acc_bias_sd=0.5,
-                      gyro_bias_sd=0.05, speed_sd=2.0)
-# Fixes wander by metres over minutes and scatter by some 0.3 m from one to the next.
-WANDER = BASE.replace(fix_sd=(0.5, 0.5, 1.0), gnss_position_error_sd=(3.0, 3.0, 15.0),
-                      gnss_position_error_tau=100.0)
 # A site is flat to 0.3 m over its length, not anew every 10 ms: some seconds of driving.
-FLAT = WANDER.replace(surface_interval=10.0)
+FLAT = config("husky")
+# Fixes wander by metres over minutes and scatter by some 0.3 m from one to the next.
+WANDER = FLAT.replace(surface="", surface_interval=0.01)
+BASE = WANDER.replace(fix_sd=(3.0, 3.0, 5.0), gnss_position_error_sd=(0.0, 0.0, 0.0))
 
 
 def main():
@@ -30,15 +28,8 @@ def main():
         return
     with open_bag(path) as reader:
         imu, fix = read_log(reader, "/imu/data"), read_log(reader, "/fix")
-    # The covariance that this receiver reports is of type unknown; the parameters rule.
-    fix.cov_enu[:] = 0.0
     valid = np.flatnonzero(fix.status >= 0)
-    first = valid[0]
-    plane = surface_from_mapping({
-        "type": "plane", "slope_deg": 0.0, "aspect_deg": 0.0, "sigma": 0.3,
-        "origin": {"latitude": float(fix.latitude_deg[first]),
-                   "longitude": float(fix.longitude_deg[first]),
-                   "height": float(np.median(fix.height[valid]))}})
+    plane = load_surface(FLAT.surface)
     lines = [f"Husky (cra-ros-pkg/robot_localization, BSD): {len(imu)} Imu samples, {len(valid)} "
              f"fixes, whose height spans {np.ptp(fix.height[valid]):.0f} m.", "",
              "| | iterations | height of the trajectory, span m | vertical sd m, median | RMS of "

@@ -142,9 +142,12 @@ def mag_values(values):
 
 
 def fix_values(values):
-    """Latitude, longitude, height, covariance row by row, status (..., 13) of NavSatFix values."""
-    return np.concatenate([values[..., 2:5], values[..., FIX["position_covariance"]],
-                           values[..., :1]], axis=-1)
+    """Latitude, longitude, height, covariance row by row, status (..., 13) of NavSatFix values.
+
+    A covariance whose type is unknown becomes zeros, whatever the message has in it."""
+    known = values[..., -1:] != 0
+    cov = np.where(known, values[..., FIX["position_covariance"]], 0.0)
+    return np.concatenate([values[..., 2:5], cov, values[..., :1]], axis=-1)
 
 
 def velocity_values(values):

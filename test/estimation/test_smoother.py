@@ -401,6 +401,10 @@ def test_a_result_to_be_doubted_says_why(jump, recording, result):
         recording.imu, recording.mag, fix, recording.velocity)
     assert claimed.misfit()["fix"] > 5.0
     assert any("fix innovations" in text and "fix_sd" in text for text in claimed.remarks())
+    # As the remark advises: what the messages claim is not taken.
+    own = Smoother(SmootherParams(fix_loss_scale=0.0, gnss_covariances=False)).run(
+        recording.imu, recording.mag, fix, recording.velocity)
+    assert abs(own.misfit()["fix"] - 1.0) < 0.2 and own.remarks() == []
 
 
 def test_given_events_are_used_without_velocities(jump, recording):

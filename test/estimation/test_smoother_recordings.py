@@ -47,9 +47,12 @@ def test_a_start_at_speed_finds_its_heading(drive, start, delays):
 
 def test_drive_with_degraded_fixes(drive):
     imu, fix, velocity, _ = drive
-    result, axes, nees = smoother_drive.degraded(imu, fix, velocity, 0)
-    # Issue 5: at most 0.50/0.76/0.45 m, NEES at most 4.
-    assert result.converged and np.all(axes <= [0.50, 0.76, 0.45]) and 1.0 < nees < 4.0
+    runs = [smoother_drive.degraded(imu, fix, velocity, seed) for seed in range(4)]
+    assert all(result.converged for result, _, _ in runs)
+    axes = np.sqrt(np.mean([axes ** 2 for _, axes, _ in runs], axis=0))
+    # Issue 5: at most 0.50/0.76/0.45 m, NEES at most 4; RMS, since seeds scatter by a quarter.
+    assert np.all(axes <= [0.50, 0.76, 0.45]), axes
+    assert 1.0 < np.mean([nees for _, _, nees in runs]) < 4.0
 
 
 def test_flight_innovations():

@@ -52,6 +52,11 @@ def test_fix_round_trip_with_and_without_covariance():
     assert list(log.latitude_deg) == [47.4, -33.0] and list(log.longitude_deg) == [10.3, -70.0]
     assert list(log.height) == [900.0, 500.0] and list(log.status) == [2, -1]
     assert np.array_equal(log.cov_enu[0], cov) and not log.cov_enu[1].any()
+    # What a driver leaves in a covariance that it calls unknown is not taken.
+    unknown = TYPES.deserialize_cdr(messages[0], FIX.msgtype)
+    unknown.position_covariance_type = 0
+    again = bytes(TYPES.serialize_cdr(unknown, FIX.msgtype))
+    assert not convert.SAMPLE_TYPES[FIX.msgtype].read([again]).cov_enu.any()
 
 
 def test_velocity_round_trip():

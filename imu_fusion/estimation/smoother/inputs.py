@@ -152,18 +152,21 @@ class Measurements:
         return self.stamp - late[self.kind]
 
 
-def _covariances(given, default_sd, what):
-    """Covariances (m, 3, 3): the default where all zeros.
+def _roots(given, default_sd, params, what):
+    """Lower roots (m, 3, 3) of covariances: of the default where they are all zeros or not to be
+    taken.
 
     Raises:
         SampleError: a covariance that is not positive definite.
     """
     cov = given.copy()
-    cov[~np.any(cov, axis=(1, 2))] = np.diag(np.square(default_sd))
+    unknown = ~np.any(cov, axis=(1, 2)) | (not params.gnss_covariances)
+    cov[unknown] = np.diag(np.square(default_sd))
     try:
         return np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
-        raise SampleError(f"a covariance of {what} is not positive definite") from None
+        raise SampleError(f"a covariance of {what} is not positive definite (gnss_covariances: "
+                          "false takes those of the parameters instead)") from None
 
 
 def even_stamps(stamp):
@@ -237,13 +240,13 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         raise EstimationError(_NO_FIX)
     eye = np.eye(3)
     fix, stamp = _gnss_readings(fix, params)
-    root = _covariances(fix.cov_enu, params.fix_sd, "the fixes")
+    root = _roots(fix.cov_enu, params.fix_sd, params, "the fixes")
     parts.append((stamp, FIX, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
                   root, params.fix_loss_scale))
     if velocity is not None:
         velocity, stamp = _gnss_readings(
             velocity[np.isfinite(velocity.vel_world).all(axis=1)], params)
-        root = _covariances(velocity.cov_world, params.velocity_sd, "the velocities")
+        root = _roots(velocity.cov_world, params.velocity_sd, params, "the velocities")
         parts.append((stamp, VELOCITY, velocity.vel_world, root, params.fix_loss_scale))
     if mag is not None:
         mag = mag[np.isfinite(mag.mag).all(axis=1)]

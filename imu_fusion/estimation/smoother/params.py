@@ -42,6 +42,8 @@ class SmootherParams(Parameters):
     fix_sd: tuple[float, ...] = param((3.0, 3.0, 5.0), doc="Position noise east, north, up, "
                                       "where a fix carries no covariance", unit="m", low=1e-4,
                                       length=3)
+    gnss_covariances: bool = param(True, doc="Take the covariances that fixes and velocities carry; "
+                                   "false: fix_sd and velocity_sd for all of them")
     velocity_sd: tuple[float, ...] = param((0.1, 0.1, 0.3), doc="Velocity noise east, north, up, "
                                            "where a velocity carries no covariance", unit="m/s",
                                            low=1e-4, length=3)
