@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_fusion.estimation.consistency import nees
 from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record
@@ -77,8 +78,7 @@ def score(result, recording, jump):
     hill_imu = hill.axes @ found.as_matrix()
     degree = np.degrees(1.0)
     row = np.zeros((), _ROW)
-    row["nees"] = [np.mean(np.einsum("ni,ni->n", e, np.linalg.solve(c, e[..., None])[..., 0]))
-                   for e, c in zip(errors, covs)]
+    row["nees"] = [nees(e, c).mean() for e, c in zip(errors, covs)]
     for name, error in (("position", hill.to_hill(errors[0])),
                         ("velocity", hill.to_hill(errors[1])),
                         ("attitude", degree * hill.to_hill(found.apply(errors[2]))),

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.data import config, data_path
 from benchmarks.jumps import write
+from imu_fusion.estimation.consistency import nees
 from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
@@ -58,12 +59,6 @@ def errors(result, fix):
     return place - truth, samples["cov_position"][nearest], inside
 
 
-def nees(error, cov):
-    """Mean of e' P^-1 e; ideal 3."""
-    return float(np.mean(np.einsum("ni,ni->n", error,
-                                   np.linalg.solve(cov, error[..., None])[..., 0])))
-
-
 def withheld(imu, fix, velocity, fixed):
     """Result, 3D RMS in m and NEES inside the withheld stretches."""
     starts = np.linspace(imu.stamp[0] + 60e9, imu.stamp[-1] - 45e9, COUNT)
@@ -73,7 +68,8 @@ def withheld(imu, fix, velocity, fixed):
     result = Smoother(PARAMS).run(imu, None, fix[~hold], velocity[~hold])
     error, cov, inside = errors(result, fix)
     use = (hold & fixed)[inside]
-    return result, np.sqrt(np.mean(np.sum(error[use] ** 2, axis=1))), nees(error[use], cov[use])
+    error, cov = error[use], cov[use]
+    return result, np.sqrt(np.mean(np.sum(error ** 2, axis=1))), nees(error, cov).mean()
 
 
 def degraded(imu, fix, velocity, seed):
@@ -91,7 +87,7 @@ def degraded(imu, fix, velocity, seed):
                             np.broadcast_to(np.diag(sd_vel ** 2), (n, 3, 3)))
     result = Smoother(PARAMS).run(imu, None, noisy, noisy_vel)
     error, cov, _ = errors(result, fix)
-    return result, np.sqrt(np.mean(error ** 2, axis=0)), nees(error, cov)
+    return result, np.sqrt(np.mean(error ** 2, axis=0)), nees(error, cov).mean()
 
 
 def main():

@@ -12,6 +12,7 @@ from rich.table import Table
 import imu_fusion
 from imu_fusion import pipeline
 from imu_fusion.errors import BagError
+from imu_fusion.estimation.consistency import nees
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import read_log, string_value
 from imu_fusion.messages.smoothing import FIX_TOPIC, SMOOTHED_FIX_TOPIC, VELOCITY_TOPIC
@@ -84,9 +85,8 @@ def _write_withheld(reader, path):
 def _add_row(table, name, world, error, cov):
     driven = "" if world is None else f"{np.linalg.norm(np.diff(world, axis=0), axis=1).sum():.0f}"
     length = np.linalg.norm(error, axis=1)
-    nees = np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0]))
     table.add_row(name, driven, f"{np.sqrt(np.mean(length ** 2)):.3f}", f"{length.max():.3f}",
-                  f"{nees:.1f}")
+                  f"{nees(error, cov).mean():.1f}")
 
 
 def jump(out, console):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_fusion.estimation.consistency import nees
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Section, Table, Text
@@ -195,8 +196,7 @@ def _truth(smoothed, reference):
             (position, rows["cov_position"], 1.0, "m", _ENU, "position"),
             (attitude, rows["cov_attitude"], np.degrees(1.0), "°", _XYZ, "attitude about")):
         sd = scale * _sd(cov)
-        ratio = np.mean(np.einsum("ni,ni->n", error / scale, np.linalg.solve(
-            cov, (error / scale)[..., None])[..., 0]))
+        ratio = nees(error / scale, cov).mean()
         rms = np.sqrt(np.mean(error ** 2, axis=0))
         table.append((what.removesuffix(" about"), *(number(r, 3) for r in rms), unit,
                       number(ratio, 2)))

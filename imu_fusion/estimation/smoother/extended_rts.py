@@ -32,6 +32,7 @@ from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import hill_axes
 from imu_fusion.geometry.gravity import normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
+from imu_fusion.geometry.rotation import skew
 from imu_fusion.surfaces.hill import Hill
 
 _R, _V, _Q = slice(0, 3), slice(3, 6), slice(6, 10)
@@ -51,22 +52,18 @@ _R_NORM = 0.01 ** 2
 _NAMES = {FIX: "fix", VELOCITY: "velocity", MAG: "mag"}
 
 
-def _skew(v):
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 def _to_ned(q):
     """M_BO transposed (47), without normalisation, as the derivatives need it."""
     w, v = q[0], q[1:]
-    return (w * w - v @ v) * _EYE + 2.0 * v[:, None] * v + 2.0 * w * _skew(v)
+    return (w * w - v @ v) * _EYE + 2.0 * v[:, None] * v + 2.0 * w * skew(v)
 
 
 def _d_to_ned(q, u):
     """Derivative (3, 4) of M_BO' u by q."""
     w, v = q[0], q[1:]
     out = np.empty((3, 4))
-    out[:, 0] = w * u + _skew(v) @ u
-    out[:, 1:] = (v @ u) * _EYE + v[:, None] * u - u[:, None] * v - w * _skew(u)
+    out[:, 0] = w * u + skew(v) @ u
+    out[:, 1:] = (v @ u) * _EYE + v[:, None] * u - u[:, None] * v - w * skew(u)
     return 2.0 * out
 
 
@@ -125,7 +122,7 @@ class Model:
         to_ned = _to_ned(x[_Q])
         rate = np.zeros(_N)
         rate[_R] = self.to_hill @ (to_ned @ x[_V])
-        rate[_V] = force + to_ned.T @ self.gravity_ned - _skew(omega) @ x[_V]
+        rate[_V] = force + to_ned.T @ self.gravity_ned - skew(omega) @ x[_V]
         rate[_Q] = 0.5 * _rate_matrix(x[_Q]) @ omega
         return rate
 
@@ -135,11 +132,11 @@ class Model:
         a, f = np.zeros((_N, _N)), np.zeros((_N, 6))
         a[_R, _V] = self.to_hill @ _to_ned(x[_Q])
         a[_R, _Q] = self.to_hill @ _d_to_ned(x[_Q], x[_V])
-        a[_V, _V] = -_skew(omega)
+        a[_V, _V] = -skew(omega)
         a[_V, _Q] = _d_to_body(x[_Q], self.gravity_ned)
-        a[_V, _DW] = -_skew(x[_V])
+        a[_V, _DW] = -skew(x[_V])
         a[_V, _DA] = -_EYE
-        a[6, 7:10], a[7:10, 6], a[7:10, 7:10] = -omega, omega, -_skew(omega)
+        a[6, 7:10], a[7:10, 6], a[7:10, 7:10] = -omega, omega, -skew(omega)
         a[_Q, _Q] *= 0.5
         a[_Q, _DW] = -0.5 * _rate_matrix(x[_Q])
         f[:, :3], f[:, 3:] = a[:, _DW], a[:, _DA]
