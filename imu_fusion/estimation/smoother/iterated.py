@@ -1,8 +1,8 @@
 """The iterated smoother: Gauss-Newton on one explicit cost.
 
-    J = sum of squared normalised process noise + squared normalised initial error
-        + sum over fixes, velocities and magnetometer readings of loss(residual)
-        + sum over constraint rows of (residual / sigma)^2
+    J = 1/2 [ sum of squared normalised process noise + squared normalised initial error
+              + sum over fixes, velocities and magnetometer readings of loss(residual)
+              + sum over constraint rows of (residual / sigma)^2 ]
 
 An extended Kalman filter gives the first trajectory. Each step linearises the motion and
 all rows about the last trajectory and solves the linear problem exactly, by a filter

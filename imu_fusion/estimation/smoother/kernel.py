@@ -96,8 +96,8 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             if kind == FIX:
                 predicted = predict_fix(x[k], tau, rate, force, rotation, lever, layout, h)
             elif kind == VELOCITY:
-                predicted = predict_velocity(x[k], tau, dt, rate, force, rotation, f_vel, lever,
-                                             layout, h)
+                predicted = predict_velocity(x[k], tau, dt, rate, force, rotation, f_vel, columns,
+                                             lever, layout, h)
             else:
                 predicted = predict_mag(x[k], tau, rate, rotation, field, layout, h)
             # Whitening keeps the rows of one measurement independent.
