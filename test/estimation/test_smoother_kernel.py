@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from imu_fusion.estimation.smoother import kernel, model, transition
+from imu_fusion.estimation.smoother.inputs import lever_gradient, surface_points
 from imu_fusion.geometry.rotation import skew
 
 LAYOUT, SIZE = model.make_layout([name for name, _ in model.BLOCKS])
@@ -130,6 +131,31 @@ def test_measurement_rows_match_differences(kind, tau):
                     else [6, 7, 8]]).max() >= 1.0
 
 
+def test_rows_of_a_surface_match_differences():
+    """A point at a lever arm, on a curved surface."""
+    rng = np.random.default_rng(6)
+    states = np.stack([random_state(rng) for _ in range(3)])
+    at = slice(LAYOUT[model.SURFACE_ARM] + 1, LAYOUT[model.SURFACE_ARM] + 4)
+    start = np.array([0, 1, 1, 3])  # rows of samples 0, 2 and 2
+
+    def residual(states):
+        p = surface_points(states[:, 0:3], states[:, 6:10], states[:, at])[[0, 2, 2]]
+        return p[:, 2] - 0.05 * p[:, 0] ** 2 + np.array([0.0, 0.3, -0.2]) * p[:, 1]
+
+    p = surface_points(states[:, 0:3], states[:, 6:10], states[:, at])[[0, 2, 2]]
+    gradient = np.stack([-0.1 * p[:, 0], [0.0, 0.3, -0.2], np.ones(3)], axis=1)
+    turned, along = lever_gradient(start, gradient, states[:, 6:10], states[:, at])
+    rows = np.zeros((3, SIZE))
+    rows[:, 0:3], rows[:, 6:9], rows[:, at.start - 1:at.stop - 1] = gradient, turned, along
+    for i in range(SIZE):
+        up, down = (residual(np.stack([perturbed(x, i, step) for x in states]))
+                    for step in (1e-5, -1e-5))
+        # Differences of values near 100 by 2e-5.
+        assert np.allclose((up - down) / 2e-5, rows[:, i], rtol=0, atol=1e-7), i
+    fixed = lever_gradient(start, gradient, states[:, 6:10], states[0, at])[0]
+    assert np.array_equal(fixed[0], turned[0]) and not np.allclose(fixed[1:], turned[1:])
+
+
 def test_solver_agrees_with_dense_algebra():
     """Posterior of a short linearised problem by stacking all noises and inverting."""
     rng = np.random.default_rng(2)
@@ -159,7 +185,7 @@ def test_solver_agrees_with_dense_algebra():
     measured = (start, kinds, tau, values, whiten, np.zeros(5))
     row_sample = np.array([0, 3, 3, 6])
     rows = (np.searchsorted(row_sample, np.arange(count + 1)), rng.standard_normal(4),
-            rng.standard_normal((4, 3)), np.full(4, 0.7), np.array([True, False, True, True]))
+            rng.standard_normal((4, 9)), np.full(4, 0.7), np.array([True, False, True, True]))
     prior_delta, prior_sd = 0.1 * rng.standard_normal(n), rng.uniform(0.2, 1.0, n)
 
     # Dense: every delta_k is linear in (delta_0, w_0, ...), so are all residuals.
@@ -199,7 +225,8 @@ def test_solver_agrees_with_dense_algebra():
         r_all.append(whiten[m] @ (values[m] - predicted - h @ means[k]))
     for c, k in enumerate(row_sample):
         h = np.zeros(n)
-        h[0:3] = rows[2][c]
+        h[0:3], h[6:9] = rows[2][c, 0:3], rows[2][c, 3:6]
+        h[LAYOUT[model.SURFACE_ARM]:LAYOUT[model.SURFACE_ARM] + 3] = rows[2][c, 6:9]
         gap = -rows[1][c]
         if rows[4][c]:
             h[LAYOUT[model.BODY_HEIGHT]] = -1.0

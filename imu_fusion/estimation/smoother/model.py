@@ -21,9 +21,10 @@ POS, VEL, ATT, GYR_BIAS, ACC_BIAS, CORE = 0, 3, 6, 9, 12, 15
 #: Optional blocks of the error state, in their order, with their sizes.
 BLOCKS = (("mag_bias", 3), ("mag_scale", 3), ("gnss_position_error", 3),
           ("gnss_time_offset", 1), ("velocity_time_offset", 1), ("acc_matrix", 9),
-          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1), ("gnss_velocity_error", 3))
+          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1), ("surface_lever_arm", 3),
+          ("gnss_velocity_error", 3))
 (MAG_BIAS, MAG_SCALE, GNSS_ERROR, TIME_OFFSET, VELOCITY_OFFSET, ACC_MATRIX, GYR_SCALE,
- LEVER_ARM, BODY_HEIGHT, GNSS_VELOCITY_ERROR) = range(10)
+ LEVER_ARM, BODY_HEIGHT, SURFACE_ARM, GNSS_VELOCITY_ERROR) = range(len(BLOCKS))
 
 FIX, VELOCITY, MAG = 0, 1, 2
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.inputs import evaluate_constraints, surface_points
 
 _STRETCH = 1.0  # s, over which deviations are averaged: slower than what the Imu itself holds
 
@@ -27,6 +28,34 @@ class SurfaceFit:
     excess: float
 
 
+def at_surface(samples, states, params):
+    """Samples whose ``position_world``, ``vel_world`` and ``cov_position`` are those of the point
+    that is held on the surface: p + R l, v + R (w x l).
+
+    The errors of position, attitude and lever arm count as uncorrelated. Across the surface
+    they are not, and the point is known better than that.
+
+    Args:
+        samples, states: of the SmootherResult.
+        params: SmootherParams.
+    """
+    lever, sd = states.get("surface_lever_arm", (np.array(params.surface_lever_arm), 0.0))
+    if not np.any(lever):
+        return samples
+    lever = np.broadcast_to(lever, samples["position_world"].shape)
+    turn = Rotation.from_quat(samples["quat_world_imu"])
+    # Rows of R [l]x are those of R, crossed with l.
+    arm = np.cross(turn.as_matrix(), lever[:, None])
+    moved = samples.copy()
+    moved["position_world"] = surface_points(samples["position_world"],
+                                             samples["quat_world_imu"], lever)
+    moved["vel_world"] += turn.apply(np.cross(samples["gyr"], lever))
+    spread = turn.as_matrix() * np.broadcast_to(sd, lever.shape)[:, None]
+    moved["cov_position"] += (arm @ samples["cov_attitude"] @ arm.swapaxes(1, 2)
+                              + spread @ spread.swapaxes(1, 2))
+    return moved
+
+
 def surface_fits(constraints, samples, states, events, params):
     """Name of the constraint -> :class:`SurfaceFit`, for those that hold anywhere.
 
@@ -35,9 +64,10 @@ def surface_fits(constraints, samples, states, events, params):
         params: SmootherParams.
     """
     fits = {}
+    position_world = at_surface(samples, states, params)["position_world"]
     for constraint in constraints:
         start, residual, _, sigma, _ = evaluate_constraints(
-            [constraint], samples["position_world"], samples["stamp"], events, params)
+            [constraint], position_world, samples["stamp"], events, params)
         if not len(residual):
             continue
         sample = np.repeat(np.arange(len(samples)), np.diff(start))
