@@ -5,6 +5,7 @@ recording and parameters the estimates are those of the nodes, bit for bit.
 """
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameter_file import node_values, parameters_for
 from imu_fusion.samples.guard import guard_log
+from imu_fusion.surface_file import load_surface
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,12 @@ class Stage:
         """(Stage, parameters): with ``configure``, topics may depend on the parameters."""
         if self.configure is not None:
             return self.configure(self, params_file)
+        return self, self.read_params(params_file)
+
+    def read_params(self, params_file):
+        """The objects of ``params`` in a parameter file (or None: defaults)."""
         params = parameters_for(self.params + self.node_params, self.node, params_file)
-        return self, params[:len(self.params)]
+        return params[:len(self.params)]
 
     def kind(self, topic, info):
         """The SampleType that reads a topic (bag.TopicInfo) of this stage."""
@@ -95,7 +101,8 @@ def stages():
         Stage("smoother", (smoothing.SmoothingParams,), (smoothing.SmootherNodeParams,),
               required=_types(smoothing.INPUTS, smoothing.REQUIRED),
               optional=_types(smoothing.INPUTS, [smoothing.MAG_TOPIC, smoothing.VELOCITY_TOPIC]),
-              outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings),
+              outputs=smoothing.OUTPUTS, run=smoothing.run, findings=smoothing.findings,
+              configure=_configure_smoother),
         Stage(field_stream.NODE, (field_stream.FieldConfiguration,), (EstimatorNodeParams,),
               required={}, optional={}, outputs=field_stream.OUTPUTS, run=field_stream.run,
               findings=lambda logs: [], configure=_configure_field),
@@ -112,6 +119,13 @@ def field_configuration(params_file):
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
     return field_stream.FieldConfiguration.from_mapping(values, str(params_file or ""))
+
+
+def _configure_smoother(stage, params_file):
+    params = stage.read_params(params_file)
+    if params[0].surface:
+        load_surface(params[0].surface)  # a bad file is refused before anything is read
+    return stage, params
 
 
 def _configure_field(stage, params_file):
@@ -193,9 +207,22 @@ def process(bag, out, params_file=None, without=(), remap=None, overwrite=False,
             if report.summary:
                 progress(f"{stage.node}: {report.summary}")
         found = {report.node: report.results for report in reports if report.results}
-        (writer.directory / "results.json").write_text(json.dumps(found, indent=2))
+        write_results(writer.directory, found)
     warnings += [f"{report.node}: {text}" for report in reports for text in report.remarks]
     return reports, list(dict.fromkeys(warnings))
+
+
+def write_results(directory, found):
+    """Write results.json: dict of node to plain numbers; what is not finite becomes null."""
+    def plain(value):
+        if isinstance(value, dict):
+            return {key: plain(v) for key, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    (Path(directory) / "results.json").write_text(
+        json.dumps(plain(found), indent=2, allow_nan=False))
 
 
 def inputs_of(stage, reader, remap):

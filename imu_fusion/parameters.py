@@ -21,12 +21,13 @@ from collections.abc import Mapping
 from imu_fusion.errors import ParameterError
 
 
-def param(default, *, doc, unit="", low=None, high=None, choices=None, length=None,
-          read_only=True, path=False):
+def param(default=dataclasses.MISSING, *, doc, unit="", low=None, high=None, choices=None,
+          length=None, read_only=True, path=False):
     """Declare one parameter as a dataclass field.
 
     Args:
-        default: value when nothing is given; ``None`` means unset.
+        default: value when nothing is given; ``None`` means unset. Without one the
+            parameter is required.
         doc: meaning, one sentence.
         unit: unit of the value as it is set.
         low, high: inclusive bounds, of every element for tuples.
@@ -118,7 +119,7 @@ class ParameterInfo:
         if math.isnan(number):
             refuse("is not a number")
         if self.element is int:
-            if number != int(number):
+            if not number.is_integer():
                 refuse("is not an integer")
             number = int(value)
         if (self.low is not None and number < self.low) or (
@@ -174,7 +175,7 @@ class Parameters:
             ignore: names (or prefixes ending in a dot) that belong to somebody else.
 
         Raises:
-            ParameterError: unknown name, wrong type, value out of bounds.
+            ParameterError: unknown or missing name, wrong type, value out of bounds.
         """
         flat = flatten(values)
         known = {info.name: info for info in cls.infos()}
@@ -186,6 +187,11 @@ class Parameters:
                 raise ParameterError(
                     f"unknown parameter '{name}'" + (f" (from {source})" if source else "")
                     + "; known: " + ", ".join(sorted(known)))
+        missing = [name for name, info in known.items()
+                   if info.default is dataclasses.MISSING and name not in flat]
+        if missing:
+            raise ParameterError(f"missing parameters: {', '.join(missing)}"
+                                 + (f" (from {source})" if source else ""))
         return cls(**accepted)
 
     def to_mapping(self):

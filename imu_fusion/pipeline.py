@@ -7,10 +7,11 @@ Each node is a process of an own ROS domain. The estimates are those of ``batch.
 
 from pathlib import Path
 
-from imu_fusion.batch import inputs_of, stages
+from imu_fusion.batch import inputs_of, stages, write_results
 from imu_fusion.errors import TopicError
 from imu_fusion.graph import Graph
 from imu_fusion.messages.bag import open_bag
+from imu_fusion.messages.smoothing import RESULTS_TOPIC, results_value
 
 SMOOTHER = "smoother"
 _PATIENCE = 3600.0  # s; the nodes notice by themselves when nothing can come any more
@@ -23,7 +24,7 @@ def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, log
     Args:
         bag: recording with what the smoother needs.
         out: rosbag2 directory to write: the recording, with old estimates left out, and the
-            new ones.
+            new ones; results.json beside them as of ``batch.process``.
         params_file: ROS 2 parameter file for all nodes, or None for defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
@@ -76,4 +77,8 @@ def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, log
         # understood): then its file has stopped growing.
         graph.finish("recorder", 15.0, lambda: sum(
             file.stat().st_size for file in Path(out).glob("*.mcap")))
-        return graph.domain
+        domain = graph.domain
+    with open_bag(out) as reader:
+        found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
+    write_results(out, {SMOOTHER: found[-1]} if found else {})
+    return domain

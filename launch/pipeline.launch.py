@@ -1,69 +1,83 @@
 """Replay a recording through the estimators, smooth it, record everything.
 
     ros2 launch imu_fusion pipeline.launch.py bag:=PATH [out:=DIRECTORY] [rate:=0.0]
-        [params_file:=FILE]
+        [params_file:=FILE] [report:=true]
 
 Ends by itself when everything has been played, smoothed and recorded. `imu_fusion pipeline`
 does the same without launch.
 """
 
+import sys
+
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+from launch.actions import (DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction,
+                            RegisterEventHandler)
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 
+def shutdown_after(action, reason):
+    """End everything when ``action`` has ended."""
+    return RegisterEventHandler(OnProcessExit(
+        target_action=action, on_exit=[EmitEvent(event=Shutdown(reason=reason))]))
+
+
+def shutdown_if_failed(action):
+    """End everything when ``action`` ends with another exit code than 0."""
+    return RegisterEventHandler(OnProcessExit(
+        target_action=action, on_exit=lambda event, context: EmitEvent(
+            event=Shutdown(reason=f"{event.process_name} failed")) if event.returncode else None))
+
+
+def start(context):
+    """The nodes for the arguments given: the acceleration field's where it is configured."""
+    from imu_fusion.batch import field_configuration
+
+    given = {name: LaunchConfiguration(name).perform(context)
+             for name in ("bag", "out", "rate", "params_file", "report")}
+    estimators = ["smoother", "orientation_estimator"]
+    if field_configuration(given["params_file"]).accelerometers:
+        estimators.append("acceleration_field_estimator")
+
+    def node(name, **parameters):
+        return Node(package="imu_fusion", executable=name, name=name, output="screen",
+                    parameters=[given["params_file"], parameters])
+
+    recorder = node("recorder", out=given["out"], end_with_sources=True,
+                    expected_sources=["smoother"])
+    pipeline = node("pipeline")
+    replayer = node("replayer", bag=given["bag"], rate=float(given["rate"]),
+                    wait_for_subscribers=0, wait_for_nodes=["recorder", "pipeline", *estimators])
+    nodes = [recorder, pipeline, replayer, *(node(name, qos="reliable") for name in estimators)]
+    ends = [shutdown_if_failed(replayer), shutdown_if_failed(pipeline)]
+    # The recorder ends by itself when replay and smoother have said that nothing more comes.
+    if given["report"].lower() == "true":
+        report = ExecuteProcess(output="screen", cmd=[
+            sys.executable, "-m", "imu_fusion.cli", "report", given["bag"],
+            "--estimates", given["out"], "--params-file", given["params_file"],
+            "--out", f"{given['out']}/report.html"])
+        ends += [RegisterEventHandler(OnProcessExit(target_action=recorder, on_exit=[report])),
+                 shutdown_after(report, "report written")]
+    else:
+        ends.append(shutdown_after(recorder, "recording ended"))
+    return [*nodes, *ends]
+
+
 def generate_launch_description():
-    """The arguments, the five nodes, and what ends them."""
-    arguments = [
+    """The arguments, the nodes, and what ends them."""
+    return LaunchDescription([
         DeclareLaunchArgument("bag", description="recording to replay"),
         DeclareLaunchArgument("out", default_value="smoothed",
                               description="directory of the new recording"),
         DeclareLaunchArgument("rate", default_value="0.0",
                               description="speed; 0: as fast as the nodes take it"),
+        DeclareLaunchArgument("report", default_value="false",
+                              description="true: write report.html beside the recording, too"),
         DeclareLaunchArgument(
             "params_file", description="ROS 2 parameter file",
             default_value=PathJoinSubstitution(
                 [FindPackageShare("imu_fusion"), "config", "pipeline.yaml"])),
-    ]
-    params_file = LaunchConfiguration("params_file")
-
-    def text(name):
-        return ParameterValue(LaunchConfiguration(name), value_type=str)
-
-    recorder = Node(
-        package="imu_fusion", executable="recorder", name="recorder", output="screen",
-        parameters=[params_file, {"out": text("out"), "end_with_sources": True,
-                                  "expected_sources": ["smoother"]}])
-    smoother = Node(
-        package="imu_fusion", executable="smoother", name="smoother", output="screen",
-        parameters=[params_file, {"qos": "reliable"}])
-    orientation = Node(
-        package="imu_fusion", executable="orientation_estimator", name="orientation_estimator",
-        output="screen", parameters=[params_file, {"qos": "reliable"}])
-    pipeline = Node(
-        package="imu_fusion", executable="pipeline", name="pipeline", output="screen",
-        parameters=[params_file])
-    replayer = Node(
-        package="imu_fusion", executable="replayer", name="replayer", output="screen",
-        parameters=[params_file, {
-            "bag": text("bag"), "wait_for_subscribers": 0,
-            "wait_for_nodes": ["recorder", "smoother", "orientation_estimator", "pipeline"],
-            "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}])
-
-    # The recorder ends by itself when replay and smoother have said that nothing more comes.
-    complete = RegisterEventHandler(OnProcessExit(
-        target_action=recorder, on_exit=[EmitEvent(event=Shutdown(reason="recording ended"))]))
-
-    def when_failed(node):
-        return RegisterEventHandler(OnProcessExit(
-            target_action=node, on_exit=lambda event, context: EmitEvent(
-                event=Shutdown(reason=f"{event.process_name} failed"))
-            if event.returncode else None))
-
-    return LaunchDescription([*arguments, recorder, smoother, orientation, pipeline, replayer,
-                              complete, when_failed(replayer), when_failed(pipeline)])
+        OpaqueFunction(function=start)])

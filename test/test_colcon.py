@@ -109,8 +109,11 @@ def test_launch_files_compile_and_name_our_executables(path):
     compile(tree, str(path), "exec")
     assert any(isinstance(n, ast.FunctionDef) and n.name == "generate_launch_description"
                for n in tree.body)
-    executables = {k.value.value for n in ast.walk(tree) if isinstance(n, ast.Call)
-                   for k in n.keywords if k.arg == "executable"}
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
+    # Given to Node, or to a local function that makes one of them.
+    named = [k.value for n in calls for k in n.keywords if k.arg == "executable"]
+    named += [n.args[0] for n in calls if getattr(n.func, "id", "") == "node"]
+    executables = {n.value for n in named if isinstance(n, ast.Constant)}
     assert executables and executables <= set(NODES)
 
 

@@ -40,6 +40,7 @@ def test_values_are_converted_and_dotted_names_reach_their_fields():
     ({"noise": True}, "'noise'.*not a number"),
     ({"noise": None}, "'noise'.*not a value"),
     ({"count": 2.5}, "'count'.*not an integer"),
+    ({"count": float("inf")}, "'count'.*not an integer"),
     ({"count": 0}, "'count'.*at least 1"),
     ({"method": "magic"}, "'method'.*one of fusion, gyro_mag"),
     ({"active": "yes"}, "'active'.*true or false"),
@@ -52,6 +53,17 @@ def test_values_are_converted_and_dotted_names_reach_their_fields():
 def test_bad_values_are_refused_with_name_value_and_bounds(values, words):
     with pytest.raises(ParameterError, match=words):
         Example.from_mapping(values, source="file.yaml")
+
+
+def test_a_parameter_without_default_is_required():
+    @dataclass(frozen=True)
+    class Required(Parameters):
+        radius: float = param(doc="Radius.")
+        width: float = param(1.0, doc="Width.")
+
+    assert Required.from_mapping({"radius": 3}).radius == 3.0
+    with pytest.raises(ParameterError, match=r"missing parameters: radius \(from file.yaml\)"):
+        Required.from_mapping({"width": 3}, source="file.yaml")
 
 
 def test_dataclass_is_checked_however_it_is_made():

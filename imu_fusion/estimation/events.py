@@ -19,12 +19,41 @@ class JumpEvents:
     touchdown: int
 
 
+def find_jump(imu, velocity, takeoff=None, touchdown=None):
+    """Take-off and touch-down, as given or else detected.
+
+    Args:
+        imu: ImuLog. velocity: VelocityLog or None, not needed when both are given.
+        takeoff, touchdown: s since the first Imu sample, or None.
+
+    Returns:
+        JumpEvents.
+
+    Raises:
+        EstimationError: not within the recording, not in this order, or not detected.
+    """
+    length = (imu.stamp[-1] - imu.stamp[0]) * 1e-9
+    for name, at in (("takeoff", takeoff), ("touchdown", touchdown)):
+        if at is not None and at > length:
+            raise EstimationError(f"{name} is given as {at:g} s, but the Imu samples end at "
+                                  f"{length:.1f} s")
+    found = detect_jump(imu, velocity) if None in (takeoff, touchdown) else None
+    stamps = [detected if at is None else int(imu.stamp[0]) + round(at * 1e9)
+              for at, detected in ((takeoff, found and found.takeoff),
+                                   (touchdown, found and found.touchdown))]
+    if stamps[1] <= stamps[0]:
+        raise EstimationError("the touch-down that was detected is before the take-off that was "
+                              "given, or the reverse: give both (takeoff, touchdown)")
+    return JumpEvents(*stamps)
+
+
 def detect_jump(imu, velocity):
     """Take-off and touch-down from peaks of the specific force (Fang 2020, appendix A).
 
     Args:
         imu: ImuLog.
-        velocity: VelocityLog; its speed limits the search to the fast part.
+        velocity: VelocityLog; its speed limits the search to the fast part. What is not finite
+            is left out.
 
     Returns:
         JumpEvents.
@@ -32,16 +61,19 @@ def detect_jump(imu, velocity):
     Raises:
         EstimationError: no fast part, or no two peaks.
     """
+    if velocity is not None:
+        velocity = velocity[np.isfinite(velocity.vel_world).all(axis=1)]
     if velocity is None or len(velocity) < 2:
         raise EstimationError("take-off and touch-down cannot be detected without GNSS "
-                              "velocities: give the events")
+                              "velocities: give them (parameters takeoff and touchdown)")
     origin = imu.stamp[0]
     speed = np.interp(imu.stamp - origin, velocity.stamp - origin,
                       np.linalg.norm(velocity.vel_world, axis=1))
     force = np.linalg.norm(imu.acc, axis=1)
     fast = (speed > _MIN_SPEED) & np.isfinite(force)
     if not fast.any():
-        raise EstimationError(f"no take-off: the speed never exceeds {_MIN_SPEED:g} m/s")
+        raise EstimationError(f"no take-off: the speed never exceeds {_MIN_SPEED:g} m/s "
+                              "(parameters takeoff and touchdown give it)")
     candidates = np.where(fast, force, -np.inf)
     first = int(np.argmax(candidates))
     # (A2), with the sense of the inequality that the text describes.
@@ -50,7 +82,7 @@ def detect_jump(imu, velocity):
     second = int(np.argmax(candidates))
     if not np.isfinite(candidates[second]):
         raise EstimationError("no take-off and touch-down: only one peak of the specific force "
-                              "at speed")
+                              "at speed (parameters takeoff and touchdown give them)")
     early, late = sorted((int(imu.stamp[first]), int(imu.stamp[second])))
     return JumpEvents(early, late - int(_LEAD * 1e9))
 
@@ -128,21 +160,47 @@ def refine_jump(hill, samples, imu, events):
 
 @dataclass(frozen=True)
 class JumpResult:
-    """What is reported of a jump: m, m/s, degrees, s."""
+    """What is reported of a jump: m, m/s, degrees, s; ``*_sd`` are standard deviations.
+
+    ``in_run_speed`` is None where the recording begins behind the in-run."""
 
     takeoff_stamp: int
     touchdown_stamp: int
-    in_run_speed: float
+    in_run_speed: float | None
+    in_run_speed_sd: float | None
     takeoff_speed: float
+    takeoff_speed_sd: float
     takeoff_angle_deg: float
+    takeoff_angle_sd_deg: float
     flight_time: float
+    flight_time_sd: float
     length: float
     length_sd: float
     landing_speed: float
+    landing_speed_sd: float
 
     def to_mapping(self):
         """Names and values, for JSON and CSV."""
         return asdict(self)
+
+
+def _in_air(samples, event, after):
+    """Velocity (3,) m/s and acceleration (3,) m/s^2 of the air's side of an event, where the
+    velocity has a kink: from the two samples after it or before it; and the sample between."""
+    stamp = samples["stamp"]
+    i = int(np.searchsorted(stamp, event)) if after else int(
+        np.searchsorted(stamp, event, side="right")) - 2
+    i = min(max(i, 0), len(stamp) - 2)
+    near = i if after else i + 1
+    vel = samples["vel_world"]
+    acc = (vel[i + 1] - vel[i]) / ((stamp[i + 1] - stamp[i]) * 1e-9)
+    return vel[near] + acc * ((event - stamp[near]) * 1e-9), acc, near
+
+
+def _sd(direction, cov, timing, acc):
+    """Standard deviation of the component of a velocity along a direction (3,), with
+    covariance (3, 3), at an event dated to ``timing`` s with acceleration (3,)."""
+    return float(np.hypot(np.sqrt(direction @ cov @ direction), timing * (direction @ acc)))
 
 
 def jump_result(hill, samples, imu, events):
@@ -151,35 +209,58 @@ def jump_result(hill, samples, imu, events):
     The length is that of the landing profile up to the touch-down; its standard deviation
     joins the position's along the profile and the date's times the speed. The take-off angle
     is that of the velocity at the edge, upwards positive; the in-run speed is the mean over
-    the last 10 m of the table side, as light barriers measure it.
+    the last 10 m before the edge, as light barriers measure it.
 
     Args:
         hill: Hill.
         samples: structured array of the smoother.
         imu: ImuLog.
         events: JumpEvents.
+
+    Raises:
+        EstimationError: the touch-down is not beyond the table.
     """
-    takeoff = _interpolate(events.takeoff, samples, "vel_world")
-    landing = _interpolate(events.touchdown, samples, "vel_world")
+    stamp, cov_velocity = samples["stamp"], samples["cov_velocity"]
+    takeoff, off_acc, edge = _in_air(samples, events.takeoff, after=True)
+    landing, down_acc, touch = _in_air(samples, events.touchdown, after=False)
     x, _, _ = hill.to_hill(_interpolate(events.touchdown, samples, "position_world"))
-    slope = float(hill.landing(x)[1])
-    i = int(np.searchsorted(samples["stamp"], events.touchdown))
-    i = min(i, len(samples) - 1)
-    cov = hill.axes @ samples["cov_position"][i] @ hill.axes.T
-    # On the profile dL = sqrt(1 + slope^2) dx.
-    stretch = np.hypot(1.0, slope)
+    if x <= 0.0:
+        raise EstimationError(f"at touch-down the smoothed trajectory is {-x:.1f} m before the "
+                              "edge of the table: take-off and touch-down are taken wrongly "
+                              "(parameters takeoff and touchdown give them), or the hill is "
+                              "another one")
     onset = impact_onset(imu, events.touchdown)
     timing = onset[1] if onset is not None else _LEAD
-    forward = float(hill.to_hill(landing)[0])
-    x_hill = hill.to_hill(samples["position_world"])[:, 0]
-    table = (samples["stamp"] < events.takeoff) & (x_hill > -10.0)
+
+    # On the profile dL = sqrt(1 + slope^2) dx.
+    slope = float(hill.landing(x)[1])
+    forward = hill.axes[0]
+    cov_x = np.einsum("i,nij,j->n", forward, samples["cov_position"], forward)
+    length_sd = np.hypot(1.0, slope) * np.hypot(np.sqrt(cov_x[touch]),
+                                                timing * (forward @ landing))
+    edge_timing = np.sqrt(cov_x[edge]) / (forward @ takeoff)
     speed = np.linalg.norm(samples["vel_world"], axis=1)
+    takeoff_speed, landing_speed = np.linalg.norm(takeoff), np.linalg.norm(landing)
+    horizontal = np.hypot(*takeoff[:2])
+    raised = np.array([*(-takeoff[2] * takeoff[:2] / horizontal), horizontal])
+    table = np.flatnonzero((stamp < events.takeoff)
+                           & (hill.to_hill(samples["position_world"])[:, 0] > -10.0))
+    in_run = in_run_sd = None
+    if len(table):
+        # Errors of the velocity hardly change over 0.4 s.
+        middle = table[len(table) // 2]
+        in_run = float(speed[table].mean())
+        in_run_sd = _sd(samples["vel_world"][middle] / speed[middle], cov_velocity[middle],
+                        0.0, np.zeros(3))
     return JumpResult(
         takeoff_stamp=events.takeoff, touchdown_stamp=events.touchdown,
-        in_run_speed=float(speed[table].mean()) if table.any() else float("nan"),
-        takeoff_speed=float(np.linalg.norm(takeoff)),
-        takeoff_angle_deg=float(np.degrees(np.arctan2(takeoff[2], np.hypot(*takeoff[:2])))),
+        in_run_speed=in_run, in_run_speed_sd=in_run_sd, takeoff_speed=float(takeoff_speed),
+        takeoff_speed_sd=_sd(takeoff / takeoff_speed, cov_velocity[edge], edge_timing, off_acc),
+        takeoff_angle_deg=float(np.degrees(np.arctan2(takeoff[2], horizontal))),
+        takeoff_angle_sd_deg=float(np.degrees(
+            _sd(raised / takeoff_speed ** 2, cov_velocity[edge], edge_timing, off_acc))),
         flight_time=(events.touchdown - events.takeoff) * 1e-9,
-        length=float(hill.jump_length(x)),
-        length_sd=float(stretch * np.sqrt(cov[0, 0] + (timing * forward) ** 2)),
-        landing_speed=float(np.linalg.norm(landing)))
+        flight_time_sd=float(np.hypot(timing, edge_timing)),
+        length=float(hill.jump_length(x)), length_sd=float(length_sd),
+        landing_speed=float(landing_speed), landing_speed_sd=_sd(
+            landing / landing_speed, cov_velocity[touch], timing, down_acc))

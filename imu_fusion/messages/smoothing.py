@@ -4,16 +4,22 @@ The node collects while a bag plays or a robot runs; batch reads whole logs. Bot
 end in :func:`smooth`, and so in the same messages.
 """
 
+import json
 from array import array
 from dataclasses import dataclass
 
 import numpy as np
+from rosbags.typesys.stores.ros2_jazzy import (
+    builtin_interfaces__msg__Time as Time,
+    diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
+    diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
+    diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, MessageError, SampleError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.messages.bag import TYPES
-from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message, imu_message
+from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameters import param
@@ -29,9 +35,14 @@ REQUIRED = (IMU_TOPIC, FIX_TOPIC)
 
 ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
 SMOOTHED_FIX_TOPIC, PATH_TOPIC = "smoother/fix", "smoother/path"
-PATH_TYPE = "nav_msgs/msg/Path"
+RESULTS_TOPIC = "smoother/results"
+PATH_TYPE, RESULTS_TYPE = "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticArray"
 OUTPUTS = {ODOMETRY_TOPIC: ODOMETRY.msgtype, SMOOTHED_IMU_TOPIC: IMU.msgtype,
-           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE}
+           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE, RESULTS_TOPIC: RESULTS_TYPE}
+PER_SAMPLE = (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, SMOOTHED_FIX_TOPIC)
+
+
+_SLICE = 1000  # samples whose messages are made at once
 
 
 @dataclass(frozen=True)
@@ -50,7 +61,9 @@ class SmootherNodeParams(EstimatorNodeParams):
 
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
-                                    "taken, and smoothing is refused until smoother/clear.")
+                                    "taken, and smoothing is refused until smoother/clear. Imu "
+                                    "and magnetometer at 100 Hz take 32 MB an hour; smoothing "
+                                    "takes more (docs/smoother.md).")
 
 
 class Collection:
@@ -171,47 +184,107 @@ def smooth(params, logs):
                                          chosen[FIX_TOPIC], chosen.get(VELOCITY_TOPIC))
 
 
-def results(result):
-    """Plain numbers of a SmootherResult, for JSON."""
-    numbers = {"samples": len(result.samples), "iterations": result.iterations,
-               "converged": bool(result.converged), "cost": float(result.cost[-1]),
-               "misfit": result.misfit()}
-    if result.jump is not None:
-        numbers["jump"] = result.jump.to_mapping()
-    return numbers
+@dataclass(frozen=True)
+class Outcome:
+    """What a result says in words and plain numbers: ``summary`` one line, ``remarks`` texts,
+    ``numbers`` for JSON, ``frame`` LocalFrame and ``frame_id`` of the sensor."""
+
+    summary: str
+    remarks: list
+    numbers: dict
+    frame: object
+    frame_id: str
+
+    @classmethod
+    def of(cls, result, frame_id):
+        """Of a SmootherResult."""
+        numbers = {"samples": len(result.samples), "iterations": result.iterations,
+                   "converged": result.converged, "cost": float(result.cost[-1]),
+                   "misfit": result.misfit()}
+        if result.jump is not None:
+            numbers["jump"] = result.jump.to_mapping()
+        return cls(result.summary(), result.remarks(), numbers, result.frame, frame_id)
+
+    def message(self, stamp):
+        """CDR bytes of the diagnostic_msgs/DiagnosticArray on smoother/results; values are JSON."""
+        values = [KeyValue(key=key, value=json.dumps(value))
+                  for key, value in {**self.numbers, "remarks": self.remarks}.items()]
+        status = DiagnosticStatus(level=int(bool(self.remarks)), name="smoother",
+                                  message=self.summary, hardware_id=self.frame_id, values=values)
+        header = Header(stamp=Time(*divmod(int(stamp), NANOSECONDS)), frame_id="world")
+        return bytes(TYPES.serialize_cdr(DiagnosticArray(header=header, status=[status]),
+                                         RESULTS_TYPE))
 
 
-def messages(result, frame_id, path_rate):
-    """Yield (topic, stamp, cdr) of a SmootherResult, in order of stamps, the path last.
+def results_value(cdr):
+    """The plain numbers (dict) in a message of smoother/results, with ``remarks``.
+
+    Raises:
+        MessageError: the bytes are no such message.
+    """
+    try:
+        (status,) = TYPES.deserialize_cdr(cdr, RESULTS_TYPE).status
+        return {entry.key: json.loads(entry.value) for entry in status.values}
+    except Exception as error:  # the library raises whatever the bytes lead it to
+        raise MessageError(f"{RESULTS_TOPIC}: {len(cdr)} bytes that cannot be read ({error})"
+                           ) from None
+
+
+def messages(samples, outcome, path_rate):
+    """Yield (topic, stamp, cdr) of a SmootherResult, in order of stamps, the path and the results
+    last.
 
     Odometry is in ``world`` (east-north-up at the result's frame) with the twist in the
     sensor's axes; its orientation covariance is about the fixed axes of the world.
+
+    Args:
+        samples: structured array of a SmootherResult. outcome: Outcome. path_rate: Hz.
     """
-    samples = result.samples
-    latitude, longitude, height = result.frame.to_geodetic(samples["position_world"])
-    values = np.zeros(ODOMETRY.size)
-    for i, row in enumerate(samples):
-        stamp = int(row["stamp"])
-        rotation = quat_to_matrix(row["quat_world_imu"])
-        cov_attitude = rotation @ row["cov_attitude"] @ rotation.T
-        pose_cov, twist_cov = np.zeros((6, 6)), np.zeros((6, 6))
-        pose_cov[:3, :3], pose_cov[3:, 3:] = row["cov_position"], cov_attitude
-        twist_cov[:3, :3] = rotation.T @ row["cov_velocity"] @ rotation
-        twist_cov[3:, 3:] = np.diag(row["gyr_bias_sd"] ** 2)
-        values[ODOMETRY["position"]] = row["position_world"]
-        values[ODOMETRY["orientation"]] = row["quat_world_imu"]
-        values[ODOMETRY["pose_covariance"]] = pose_cov.ravel()
-        values[ODOMETRY["linear"]] = rotation.T @ row["vel_world"]
-        values[ODOMETRY["angular"]] = row["gyr"]
-        values[ODOMETRY["twist_covariance"]] = twist_cov.ravel()
-        yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", values, frame_id)
-        yield SMOOTHED_IMU_TOPIC, stamp, imu_message(
-            stamp, frame_id, row["gyr"], row["acc"], row["quat_world_imu"], cov_attitude,
-            np.diag(row["gyr_bias_sd"] ** 2), np.diag(row["acc_bias_sd"] ** 2))
-        yield SMOOTHED_FIX_TOPIC, stamp, fix_message(
-            stamp, frame_id, latitude[i], longitude[i], height[i], row["cov_position"])
+    frame_id = outcome.frame_id
+    for first in range(0, len(samples), _SLICE):
+        rows = samples[first:first + _SLICE]
+        for stamp, odometry, imu, fix in zip(rows["stamp"], *_values(rows, outcome.frame)):
+            stamp = int(stamp)
+            yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", odometry, frame_id)
+            yield SMOOTHED_IMU_TOPIC, stamp, IMU.encode(stamp, frame_id, imu)
+            yield SMOOTHED_FIX_TOPIC, stamp, fix_message(stamp, frame_id, *fix[:3], fix[3:])
     if len(samples):
-        yield PATH_TOPIC, int(samples["stamp"][-1]), _path(samples, path_rate)
+        last = int(samples["stamp"][-1])
+        yield PATH_TOPIC, last, _path(samples, path_rate)
+        yield RESULTS_TOPIC, last, outcome.message(last)
+
+
+def _values(rows, frame):
+    """Values of the messages of samples: Odometry and Imu in the order of their layouts, latitude,
+    longitude, height and covariance; (n, size) each."""
+    n = len(rows)
+    rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    back = rotation.transpose(0, 2, 1)
+    vel_imu = np.einsum("nij,nj->ni", back, rows["vel_world"])
+    cov_attitude = rotation @ rows["cov_attitude"] @ back
+    # A wrong attitude turns the velocity, too; how the two errors go together is not kept.
+    turned = np.cross(np.eye(3), vel_imu[:, None, :])
+    pose, twist, imu = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, IMU.size))
+    pose[:, :3, :3], pose[:, 3:, 3:] = rows["cov_position"], cov_attitude
+    twist[:, :3, :3] = (back @ rows["cov_velocity"] @ rotation
+                        + turned @ rows["cov_attitude"] @ turned.transpose(0, 2, 1))
+    axes = np.arange(3)
+    twist[:, axes + 3, axes + 3] = rows["gyr_sd"] ** 2
+    odometry = np.zeros((n, ODOMETRY.size))
+    for field, value in (("position", rows["position_world"]),
+                         ("orientation", rows["quat_world_imu"]), ("linear", vel_imu),
+                         ("pose_covariance", pose.reshape(n, 36)), ("angular", rows["gyr"]),
+                         ("twist_covariance", twist.reshape(n, 36))):
+        odometry[:, ODOMETRY[field]] = value
+    for field, value in (("orientation", rows["quat_world_imu"]),
+                         ("orientation_covariance", cov_attitude.reshape(n, 9)),
+                         ("angular_velocity", rows["gyr"]), ("linear_acceleration", rows["acc"])):
+        imu[:, IMU[field]] = value
+    for field, name in (("angular_velocity_covariance", "gyr_sd"),
+                        ("linear_acceleration_covariance", "acc_sd")):
+        imu[:, IMU[field]][:, ::4] = rows[name] ** 2
+    place = np.column_stack(frame.to_geodetic(rows["position_world"]))
+    return odometry, imu, np.column_stack([place, rows["cov_position"].reshape(n, 9)])
 
 
 def _path(samples, rate):
@@ -250,7 +323,8 @@ def run(logs, report, params):
     except (EstimationError, SampleError) as error:
         report.skipped = str(error)
         return
-    report.summary = result.summary()
-    report.results = results(result)
-    report.remarks = result.remarks()
-    yield from messages(result, logs[IMU_TOPIC][0].frame_id, params.path_rate)
+    outcome = Outcome.of(result, logs[IMU_TOPIC][0].frame_id)
+    report.summary = outcome.summary
+    report.results = {**outcome.numbers, "remarks": outcome.remarks}
+    report.remarks = outcome.remarks
+    yield from messages(result.samples, outcome, params.path_rate)

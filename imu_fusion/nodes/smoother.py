@@ -3,7 +3,9 @@
 import multiprocessing
 import sys
 import time
+import traceback
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy
@@ -12,28 +14,83 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.compiling import announced_compiling
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.messages import smoothing
-from imu_fusion.messages.smoothing import (INPUTS, OUTPUTS, Collection, SmootherNodeParams,
-                                           SmoothingParams)
+from imu_fusion.messages.smoothing import (INPUTS, OUTPUTS, PER_SAMPLE, Collection,
+                                           SmootherNodeParams, SmoothingParams)
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import FlowSink, FlowSource, reliable_qos, sensor_qos
+from imu_fusion.surface_file import load_surface
 
-_LATCHED = 100_000  # messages per topic that late subscribers still get
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
+_PIECE = 10_000  # samples that the child sends at once
+_SLICE = 200  # messages published between callbacks
+
+
+def _latched(count):
+    return reliable_qos(count, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def _smooth_in_child(connection, params, logs):
-    """Entry point of the child process: sends (summary, messages) or (None, reason)."""
+    """Entry point of the child process: sends an Outcome and the number of samples, then these
+    in pieces; or the reason why there are none."""
     try:
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smoothing.smooth(params, logs)
-        frame_id = logs[smoothing.IMU_TOPIC][0].frame_id
-        connection.send(("; ".join([result.summary(), *result.remarks()]),
-                         list(smoothing.messages(result, frame_id, params.path_rate))))
+        samples = result.samples
+        outcome = smoothing.Outcome.of(result, logs[smoothing.IMU_TOPIC][0].frame_id)
+        connection.send((outcome, len(samples)))
+        for i in range(0, len(samples), _PIECE):
+            connection.send_bytes(samples[i:i + _PIECE].tobytes())
     except ImuFusionError as error:
-        connection.send((None, str(error)))
+        connection.send((str(error), 0))
     except KeyboardInterrupt:
         pass  # the parent is ending, too
+    except Exception as error:
+        traceback.print_exc()
+        connection.send((f"smoothing failed: {type(error).__name__}: {error}", 0))
+
+
+class _Child:
+    """A child process that smooths, and what has come from it."""
+
+    def __init__(self, params, logs):
+        spawn = multiprocessing.get_context("spawn")
+        self._pipe, theirs = spawn.Pipe(duplex=False)
+        self._process = spawn.Process(target=_smooth_in_child, daemon=True,
+                                      args=(theirs, params, logs))
+        self._process.start()
+        theirs.close()
+        self.outcome = self.samples = None  # an Outcome, or the reason why there is none
+        self._received = 0
+
+    def poll(self):
+        """Take what has come; whether that is all."""
+        try:
+            if self._pipe.poll():
+                if self.outcome is None:
+                    self.outcome, count = self._pipe.recv()
+                    self.samples = np.empty(count, SAMPLE)
+                else:
+                    piece = np.frombuffer(self._pipe.recv_bytes(), SAMPLE)
+                    self.samples[self._received:self._received + len(piece)] = piece
+                    self._received += len(piece)
+                return self._received == len(self.samples)
+        except EOFError:
+            pass
+        else:
+            if self._process.is_alive() or self._pipe.poll():
+                return False
+        self._process.join()
+        self.outcome = ("the smoothing process ended without an answer (exit code "
+                        f"{self._process.exitcode}): out of memory?")
+        return True
+
+    def close(self):
+        if self._process.is_alive() and self.outcome is None:
+            self._process.kill()
+        self._process.join()
+        self._pipe.close()
 
 
 class SmootherNode(Node):
@@ -54,11 +111,12 @@ class SmootherNode(Node):
         for topic, kind in INPUTS.items():
             self._sink.subscribe(message_class(kind.layout.msgtype), topic,
                                  lambda cdr, _, topic=topic: self._collection.push(topic, cdr), qos)
+        if self.params(SmoothingParams).surface:
+            load_surface(self.params(SmoothingParams).surface)  # a bad file ends the node now
         self._source = FlowSource(self)
-        latched = reliable_qos(_LATCHED, DurabilityPolicy.TRANSIENT_LOCAL)
-        self._outputs = {topic: self._source.publisher(message_class(msgtype), topic, latched)
+        self._outputs = {topic: self._source.publisher(message_class(msgtype), topic, _latched(1))
                          for topic, msgtype in OUTPUTS.items()}
-        self._child = self._answer = self._pipe = None
+        self._child = self._answer = self._result = self._messages = None
         # Reentrant: a second call is answered while the first one still waits.
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
@@ -67,24 +125,18 @@ class SmootherNode(Node):
 
     def work(self):
         """See :meth:`Node.work`."""
-        if self._answer is None:
-            return IDLE
-        # The executor polls the coroutine of a waiting service without rest.
-        time.sleep(_POLL)
-        if self._answer.done():
-            pass
-        elif self._pipe.poll():
-            self._child_answered()
-        elif not self._child.is_alive() and not self._pipe.poll():
-            self._answer.set_result((None, "the smoothing process ended without an answer (exit "
-                                     f"code {self._child.exitcode}): out of memory?"))
-        return 0.0
+        if self._answer is not None:
+            # The executor polls the coroutine of a waiting service without rest.
+            time.sleep(_POLL)
+            if not self._answer.done() and self._child.poll():
+                self._answer.set_result(self._child.outcome)
+            return 0.0
+        return 0.0 if self._publish() else IDLE
 
     def close(self):
         """End the child, if there is one."""
-        if self._child is not None and self._child.is_alive():
-            self._child.kill()
-            self._child.join()
+        if self._child is not None:
+            self._child.close()
 
     def stop(self):
         self._source.end()
@@ -95,46 +147,65 @@ class SmootherNode(Node):
             self._collection.clear()
 
     async def _on_smooth(self, request, response):
+        response.success = False
         if self._answer is not None:
-            response.success, response.message = False, "refused: smoothing is already running"
+            response.message = "refused: smoothing is already running"
+            return response
+        if self._result is not None or self._messages is not None:
+            response.message = "refused: the last result is still being published"
             return response
         try:
             logs = self._collection.logs()
             smoothing.newest_epoch(logs)
         except ImuFusionError as error:
-            response.success, response.message = False, str(error)
+            response.message = str(error)
             return response
-        spawn = multiprocessing.get_context("spawn")
-        self._pipe, theirs = spawn.Pipe(duplex=False)
-        self._child = spawn.Process(target=_smooth_in_child, daemon=True,
-                                    args=(theirs, self.params(SmoothingParams), logs))
-        self._answer = Future()
-        self._child.start()
-        theirs.close()
         counts = ", ".join(f"{len(log)} {topic}" for topic, (log, _) in logs.items())
         self.get_logger().info(f"smoothing {counts}")
-        summary, outcome = await self._answer
-        self._child.join()
-        self._child = self._answer = None
-        self._pipe.close()
-        response.success = summary is not None
-        response.message = summary if response.success else outcome
-        if response.success:
-            self._publish(outcome)
+        self._answer = Future()
+        self._child = _Child(self.params(SmoothingParams), logs)
+        del logs
+        outcome = await self._answer
+        child, self._child, self._answer = self._child, None, None
+        child.close()
+        if isinstance(outcome, str):
+            response.message = outcome
+        else:
+            response.success = True
+            response.message = "; ".join([outcome.summary, *outcome.remarks])
+            self._result = child.samples, outcome
         self.get_logger().info(response.message)
         return response
 
-    def _child_answered(self):
-        try:
-            self._answer.set_result(self._pipe.recv())
-        except EOFError:
-            self._answer.set_result((None, "the smoothing process ended without an answer"))
+    def _publish(self):
+        """Publish some of a result, as the subscribers take it; whether more could follow now.
 
-    def _publish(self, messages):
-        self._source.begin()
-        for topic, _, cdr in messages:
+        Publishers are made anew: what late subscribers get is all of this result and nothing
+        of those before.
+        """
+        if self._result is not None:
+            if not self._source.drained():
+                return False
+            samples, outcome = self._result
+            self._result = None
+            for topic, output in self._outputs.items():
+                output.renew(_latched(len(samples) if topic in PER_SAMPLE else 1))
+            self._source.begin()
+            self._messages = smoothing.messages(samples, outcome,
+                                                self.params(SmoothingParams).path_rate)
+        if self._messages is None:
+            return False
+        for _ in range(_SLICE):
+            if not self._source.ready():
+                return False
+            message = next(self._messages, None)
+            if message is None:
+                self._messages = None
+                self._source.end()
+                return False
+            topic, _, cdr = message
             self._outputs[topic].publish(cdr)
-        self._source.end()
+        return True
 
     def _on_clear(self, request, response):
         self._collection.clear()
@@ -152,6 +223,8 @@ class SmootherNode(Node):
             return DiagnosticStatus.ERROR, "memory_limit reached, samples are dropped", values
         if self._answer is not None:
             return DiagnosticStatus.OK, "smoothing", values
+        if self._result is not None or self._messages is not None:
+            return DiagnosticStatus.OK, "publishing", values
         return DiagnosticStatus.OK, "collecting", values
 
 

@@ -101,7 +101,8 @@ def smoother_sections(smoothed, reference=None):
 def smoother_numbers(result):
     """The key numbers of a result: a tuple of Number."""
     sd = np.sqrt(np.median(np.trace(result.samples["cov_position"], axis1=1, axis2=2)))
-    state = "converged" if result.converged else "NOT CONVERGED"
+    state = {None: "single pass", True: "converged",
+             False: "NOT CONVERGED"}[result.converged]
     items = [Number("Iterations", str(result.iterations), state),
              Number("Position σ", f"{number(sd, 2)} m", "3D, median")]
     if result.jump is not None:
@@ -133,19 +134,28 @@ def _trajectory(smoothed):
 
 def _jump(smoothed):
     jump, result = smoothed.result.jump, smoothed.result
-    rows = (("jump length", number(jump.length, 2), "m"),
-            ("its standard deviation", number(jump.length_sd, 2), "m"),
-            ("in-run speed, last 10 m of the table", number(jump.in_run_speed, 2), "m/s"),
-            ("take-off speed", number(jump.takeoff_speed, 2), "m/s"),
-            ("take-off angle, upwards positive", number(jump.takeoff_angle_deg, 2), "°"),
-            ("flight time", number(jump.flight_time, 3), "s"),
-            ("landing speed", number(jump.landing_speed, 2), "m/s"),
-            ("take-off", number(float(seconds(jump.takeoff_stamp, smoothed.origin)), 3), "s"),
-            ("touch-down", number(float(seconds(jump.touchdown_stamp, smoothed.origin)), 3), "s"))
+
+    def row(name, value, sd, unit, digits=2):
+        known = value is not None
+        return (name, number(value, digits) if known else "not recorded",
+                number(sd, digits + 1) if known and sd is not None else "", unit)
+
+    def event(name, stamp):
+        return row(name, float(seconds(stamp, smoothed.origin)), None, "s", 3)
+
+    rows = (row("jump length", jump.length, jump.length_sd, "m"),
+            row("in-run speed, last 10 m before the edge", jump.in_run_speed,
+                jump.in_run_speed_sd, "m/s"),
+            row("take-off speed", jump.takeoff_speed, jump.takeoff_speed_sd, "m/s"),
+            row("take-off angle, upwards positive", jump.takeoff_angle_deg,
+                jump.takeoff_angle_sd_deg, "°"),
+            row("flight time", jump.flight_time, jump.flight_time_sd, "s", 3),
+            row("landing speed", jump.landing_speed, jump.landing_speed_sd, "m/s"),
+            event("take-off", jump.takeoff_stamp), event("touch-down", jump.touchdown_stamp))
     figure = side_figure(smoothed.surface, result.samples, smoothed.fixes_world()[1],
                          result.events)
     return Section("Jump", (
-        Table(("quantity", "value", "unit"), rows,
+        Table(("quantity", "value", "σ", "unit"), rows,
               "The length is counted along the landing profile, as the markers of a hill stand."),
         Figure(figure, "From the side, at one scale: drag to zoom, double-click to go back.",
                linked=False)))
@@ -302,8 +312,6 @@ def _before_after(smoothed):
 
 def _innovations(smoothed):
     """Normalised innovations with their bounds, and whether they are white."""
-    if not smoothed.result.innovations:
-        return Section("Innovations", (Text(f"The method {smoothed.params.method} gives none."),))
     rows, panels = [], []
     for name, (stamp, values) in smoothed.result.innovations.items():
         what, parts = _INNOVATIONS[name]

@@ -7,10 +7,14 @@ import numpy as np
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.surfaces.values import number
 
 #: Parts of a motion during which a constraint may hold. ``always`` needs no event;
 #: ``in_run`` ends with the take-off, ``landing`` begins with the touch-down.
 PHASES = ("always", "in_run", "landing")
+
+#: Standard deviation of a surface, m, where none is given (Fang 2020).
+DEFAULT_SIGMA = 0.1
 
 
 @dataclass(frozen=True)
@@ -32,8 +36,9 @@ class Constraint:
     def __post_init__(self):
         if self.phase not in PHASES:
             raise LayoutError(f"constraint {self.name}: phase {self.phase!r}, known {PHASES}")
-        if not self.sigma > 0:
-            raise LayoutError(f"constraint {self.name}: sigma must be positive, is {self.sigma} m")
+        if not 0 < self.sigma < np.inf:
+            raise LayoutError(f"constraint {self.name}: sigma must be positive and finite, is "
+                              f"{self.sigma} m")
 
 
 @dataclass(frozen=True)
@@ -48,17 +53,26 @@ class Surface:
 
 
 def split_sigma(sigma, parts):
-    """Standard deviation of each part, from one number for all or a mapping.
+    """Standard deviation (m) of each part, from one number for all or a mapping of some of
+    them; the others have :data:`DEFAULT_SIGMA`.
 
     Raises:
-        LayoutError: an unknown part.
+        LayoutError: an unknown part; no number, not finite, not positive.
     """
     if not isinstance(sigma, dict):
-        return {part: float(sigma) for part in parts}
-    unknown = set(sigma) - set(parts)
+        return dict.fromkeys(parts, _positive(sigma, "sigma"))
+    unknown = [repr(part) for part in sigma if part not in parts]
     if unknown:
-        raise LayoutError(f"sigma names {sorted(unknown)}; this surface has {list(parts)}")
-    return {part: float(sigma.get(part, 0.1)) for part in parts}
+        raise LayoutError(f"key 'sigma' names {', '.join(unknown)}; this surface has the parts "
+                          + ", ".join(parts))
+    return {part: _positive(sigma.get(part, DEFAULT_SIGMA), f"sigma.{part}") for part in parts}
+
+
+def _positive(sigma, name):
+    sigma = number(sigma, name, "m")
+    if sigma <= 0:
+        raise LayoutError(f"key '{name}': {sigma:g} m is not positive; it is a standard deviation")
+    return sigma
 
 
 def height_constraint(name, phase, sigma, elevation):

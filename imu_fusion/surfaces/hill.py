@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.geometry.geodesy import hill_axes
-from imu_fusion.surfaces.constraint import Constraint, Surface, split_sigma
+from imu_fusion.surfaces.constraint import DEFAULT_SIGMA, Constraint, Surface, split_sigma
 from imu_fusion.surfaces.profile import Profile
+from imu_fusion.surfaces.values import number
 
 PARTS = ("in_run", "in_run_lateral", "landing")
 
@@ -15,13 +16,21 @@ PARTS = ("in_run", "in_run_lateral", "landing")
 class Hill(Surface):
     """Origin at the edge of the take-off table; ``azimuth_deg`` is the direction of x,
     clockwise from north. ``k_point`` is (x of K, distance w): jump lengths are w plus the
-    length of the landing profile from K."""
+    length of the landing profile from K.
+
+    Raises:
+        LayoutError: an azimuth or sigma that is out of bounds or not finite.
+    """
 
     azimuth_deg: float
     in_run: Profile
     landing: Profile
     k_point: tuple
-    sigma: float | dict = 0.1
+    sigma: float | dict = DEFAULT_SIGMA
+
+    def __post_init__(self):
+        number(self.azimuth_deg, "azimuth_deg", "deg", -360.0, 360.0)
+        split_sigma(self.sigma, PARTS)
 
     @property
     def axes(self):

@@ -5,21 +5,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import LayoutError
-from imu_fusion.surfaces.constraint import Surface, height_constraint, split_sigma
+from imu_fusion.surfaces.constraint import (DEFAULT_SIGMA, Surface, height_constraint,
+                                            split_sigma)
+from imu_fusion.surfaces.values import number
+
+PARTS = ("plane",)
 
 
 @dataclass(frozen=True)
 class Plane(Surface):
-    """Plane through the origin, falling by ``slope_deg`` towards ``aspect_deg`` (clockwise
-    from north)."""
+    """Plane through the origin, falling by ``slope_deg`` (0 to below 90) towards
+    ``aspect_deg`` (clockwise from north).
+
+    Raises:
+        LayoutError: a value that is out of bounds or not finite.
+    """
 
     slope_deg: float = 0.0
     aspect_deg: float = 0.0
-    sigma: float = 0.1
+    sigma: float | dict = DEFAULT_SIGMA
 
     def __post_init__(self):
-        if not 0.0 <= self.slope_deg < 90.0:
-            raise LayoutError(f"plane: slope_deg {self.slope_deg} is not in 0 to 90")
+        if number(self.slope_deg, "slope_deg", "deg", 0.0, 90.0) == 90.0:
+            raise LayoutError("key 'slope_deg': a plane of 90 deg has no height above it")
+        number(self.aspect_deg, "aspect_deg", "deg", -360.0, 360.0)
+        split_sigma(self.sigma, PARTS)
 
     def constraints(self):
         aspect = np.radians(self.aspect_deg)
@@ -29,5 +39,5 @@ class Plane(Surface):
         def elevation(east, north):
             return de * east + dn * north, np.full_like(east, de), np.full_like(east, dn)
 
-        sigma = split_sigma(self.sigma, ["plane"])["plane"]
+        sigma = split_sigma(self.sigma, PARTS)["plane"]
         return (height_constraint("plane", "always", sigma, elevation),)

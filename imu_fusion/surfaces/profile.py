@@ -1,5 +1,6 @@
 """Curves z(x) of a hill's long section: x horizontal forward, z down, metres."""
 
+import reprlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,12 @@ from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
 
 from imu_fusion.errors import LayoutError
+from imu_fusion.surfaces.values import number
 
+# What rounding may leave at a joint of analytic curves some 100 m in size.
+_HEIGHT_TOLERANCE = 1e-6  # m
+_SLOPE_TOLERANCE_DEG = 1e-4
+_RADIUS_TOLERANCE = 1e-6  # of the radius; of a straight piece: 1 / m
 
 @dataclass(frozen=True)
 class Line:
@@ -122,6 +128,38 @@ class Profile:
             result[:, here] = self.pieces[i](x[here])
         return result
 
+    def check_joints(self, names, radii):
+        """Refuse a joint at which height or slope jumps or a radius is not the stated one.
+
+        Args:
+            names: of the joints, one per knot.
+            radii: name -> (radius before, radius after), m; inf for straight, None for
+                not stated.
+
+        Raises:
+            LayoutError: naming the joint and the two figures.
+        """
+        for i, (name, x) in enumerate(zip(names, self.knots)):
+            sides = [np.ravel(piece(np.array([x]))) for piece in self.pieces[i:i + 2]]
+            heights = [z for z, _, _ in sides]
+            slopes = [np.degrees(np.arctan(slope)) for _, slope, _ in sides]
+            # "not <=" refuses NaN as well.
+            if not abs(heights[1] - heights[0]) <= _HEIGHT_TOLERANCE:
+                raise LayoutError(f"joint {name} (x = {x:.3f} m): height z is {heights[0]:.6f} m "
+                                  f"before and {heights[1]:.6f} m after it")
+            if not abs(slopes[1] - slopes[0]) <= _SLOPE_TOLERANCE_DEG:
+                raise LayoutError(f"joint {name} (x = {x:.3f} m): slope is {slopes[0]:.5f} deg "
+                                  f"before and {slopes[1]:.5f} deg after it")
+            for side, radius, (_, slope, second) in zip(
+                    ("before", "after"), radii.get(name, (None, None)), sides):
+                if radius is None:
+                    continue
+                curvature = -second / (1.0 + slope ** 2) ** 1.5  # concave upwards counts positive
+                error = abs(curvature - 1.0 / radius) * (radius if np.isfinite(radius) else 1.0)
+                if not error <= _RADIUS_TOLERANCE:
+                    raise LayoutError(f"joint {name} (x = {x:.3f} m): curvature {side} it is "
+                                      f"{curvature:.8f} 1/m, the stated radius is {radius:g} m")
+
     def arc_length(self, x0, x1):
         """Signed length of the curve from x0 to x1, m."""
         joints = self.knots[(self.knots > min(x0, x1)) & (self.knots < max(x0, x1))]
@@ -129,18 +167,41 @@ class Profile:
                     points=joints if len(joints) else None, limit=200)[0]
 
 
+def table_points(points, where):
+    """Surveyed points as an array (n, 2) of increasing x.
+
+    Args:
+        points: list of [x, z], m.
+        where: name of the list, for messages.
+
+    Raises:
+        LayoutError: fewer than two points, no pairs, x not increasing, values not finite.
+    """
+    if not isinstance(points, (list, tuple, np.ndarray)) or len(points) < 2:
+        raise LayoutError(f"key '{where}': expected a list of at least two [x, z]")
+    table = np.empty((len(points), 2))
+    for i, point in enumerate(points):
+        if not isinstance(point, (list, tuple, np.ndarray)) or len(point) != 2:
+            raise LayoutError(f"key '{where}', point {i + 1}: expected [x, z], is "
+                              f"{reprlib.repr(point)}")
+        table[i] = [number(value, f"{where}, point {i + 1}, {axis}", "m")
+                    for axis, value in zip("xz", point)]
+    back = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    if len(back):
+        i = back[0] + 1
+        raise LayoutError(f"key '{where}': x must increase, point {i + 1} has {table[i, 0]:g} m "
+                          f"after {table[i - 1, 0]:g} m")
+    return table
+
+
 def table_profile(points, where):
     """Profile through surveyed points (n, 2) of increasing x: monotone cubics (PCHIP), whose
     slope is continuous and does not overshoot; straight beyond both ends.
 
     Raises:
-        LayoutError: fewer than two points, x not increasing, values not finite.
+        LayoutError: see :func:`table_points`.
     """
-    points = np.asarray(points, dtype=float)
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
-        raise LayoutError(f"{where}: expected a list of at least two [x, z]")
-    if not np.isfinite(points).all() or np.any(np.diff(points[:, 0]) <= 0):
-        raise LayoutError(f"{where}: x must increase and all values be finite")
+    points = table_points(points, where)
     curve = PchipInterpolator(points[:, 0], points[:, 1])
     slope, curvature = curve.derivative(1), curve.derivative(2)
     (x0, z0), (x1, z1) = points[0], points[-1]

@@ -55,12 +55,20 @@ def test_second_peak_is_sought_away_from_the_first(jump, recording):
     assert events.touchdown - events.takeoff > 1.5e9
 
 
+def test_velocities_that_are_not_finite_hide_no_peak(recording):
+    events = detect_jump(recording.imu, recording.velocity)
+    velocity = recording.velocity.vel_world.copy()
+    velocity[np.abs(recording.velocity.stamp - events.touchdown) < 0.15e9] = np.nan
+    assert detect_jump(recording.imu, dataclasses.replace(
+        recording.velocity, vel_world=velocity)) == events
+
+
 def test_no_jump_says_so(recording):
     slow = dataclasses.replace(recording.velocity,
                                vel_world=0.2 * recording.velocity.vel_world)
     with pytest.raises(EstimationError, match="never exceeds 10 m/s"):
         detect_jump(recording.imu, slow)
-    with pytest.raises(EstimationError, match="give the events"):
+    with pytest.raises(EstimationError, match="parameters takeoff and touchdown"):
         detect_jump(recording.imu, None)
 
 

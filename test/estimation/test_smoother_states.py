@@ -147,6 +147,7 @@ def test_samples_at_the_surface(jump):
     samples["position_world"], samples["vel_world"] = carried.position_world, carried.vel_world
     samples["quat_world_imu"], samples["gyr"] = carried.quat_world_imu, carried.omega_imu
     samples["cov_position"], samples["cov_attitude"] = 0.04 * np.eye(3), 0.01 * np.eye(3)
+    samples["gyr_sd"] = 0.2
     params = SmootherParams(surface_lever_arm=tuple(LEVER))
     given = at_surface(samples, {}, params)
     assert np.allclose(given["position_world"], skis.position_world, rtol=0, atol=1e-9)
@@ -155,11 +156,19 @@ def test_samples_at_the_surface(jump):
     arm = Rotation.from_quat(samples["quat_world_imu"]).apply(LEVER)
     along = np.einsum("ni,nij,nj->n", arm, given["cov_position"], arm) / (LEVER @ LEVER)
     assert np.allclose(along, 0.04)
-    total = np.trace(given["cov_position"], axis1=1, axis2=2)
-    assert np.allclose(total, 3 * 0.04 + 2 * 0.01 * LEVER @ LEVER)
-    found = {"surface_lever_arm": (np.tile(LEVER, (len(time), 1)),
-                                   np.tile([0.1, 0.2, 0.3], (len(time), 1)))}
+
+    def total(samples, name):
+        return np.trace(samples[name], axis1=1, axis2=2)
+
+    swing = np.sum(np.cross(carried.omega_imu, LEVER) ** 2, axis=1)
+    assert np.allclose(total(given, "cov_position"), 3 * 0.04 + 2 * 0.01 * LEVER @ LEVER)
+    assert np.allclose(total(given, "cov_velocity"), 2 * 0.01 * swing + 2 * 0.04 * LEVER @ LEVER)
+    sd = np.array([0.1, 0.2, 0.3])
+    found = {"surface_lever_arm": (np.tile(LEVER, (len(time), 1)), np.tile(sd, (len(time), 1)))}
     state = at_surface(samples, found, SmootherParams())
     assert np.allclose(state["position_world"], given["position_world"], rtol=0, atol=1e-9)
-    assert np.allclose(np.trace(state["cov_position"], axis1=1, axis2=2), total + 0.14)
+    added = sum(np.sum(np.cross(carried.omega_imu, s * axis) ** 2, axis=1)
+                for s, axis in zip(sd, np.eye(3)))
+    assert np.allclose(total(state, "cov_position"), total(given, "cov_position") + 0.14)
+    assert np.allclose(total(state, "cov_velocity"), total(given, "cov_velocity") + added)
     assert at_surface(samples, {}, SmootherParams()) is samples

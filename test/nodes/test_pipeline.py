@@ -1,12 +1,15 @@
 """The pipeline: replay, smooth, record; as nodes on one executor and as processes."""
 
+import json
+
 import pytest
 
 from imu_fusion import batch, pipeline
-from imu_fusion.errors import EstimationError, TopicError
+from imu_fusion.errors import EstimationError, LayoutError, TopicError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
+from imu_fusion.messages.smoothing import RESULTS_TOPIC, results_value
 from imu_fusion.nodes.pipeline import Pipeline
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
@@ -21,7 +24,9 @@ def fields(path, topics):
         found = {topic: [] for topic in topics}
         for topic, msgtype, _, cdr in reader.messages(topics):
             layout = LAYOUTS.get(msgtype)
-            if layout is None:
+            if topic == f"/{RESULTS_TOPIC}":
+                found[topic].append(results_value(cdr))
+            elif layout is None:
                 found[topic].append(bytes(cdr))
             else:
                 stamp, frame_id, values = layout.decode(cdr)
@@ -54,7 +59,7 @@ def test_recording_holds_all_of_the_smoother_as_batch_writes_it(graph, tmp_path)
     graph.until(lambda: node.finished and recorder.finished, timeout=120.0)
     graph.close(recorder)
     assert_same(tmp_path / "batch", out, ["/smoother/odometry", "/smoother/imu", "/smoother/fix",
-                                          "/smoother/path"])
+                                          "/smoother/path", "/smoother/results"])
     assert_same(bag, out, ["/imu/data_raw", "/fix", "/fix_velocity"])
 
 
@@ -85,6 +90,16 @@ def test_a_recording_without_fixes_is_refused_before_anything_starts(tmp_path):
         pipeline.run(write_bag(tmp_path / "bag", 20), tmp_path / "out")
 
 
+def test_a_bad_surface_is_refused_before_anything_starts(tmp_path):
+    params, out = tmp_path / "params.yaml", tmp_path / "out"
+    params.write_text("smoother: {ros__parameters: {surface: nowhere}}")
+    bag = write(tmp_path / "bag", 20)
+    for run in (pipeline.run, batch.process):
+        with pytest.raises(LayoutError, match="nowhere"):
+            run(bag, out, params)
+        assert not out.exists()
+
+
 @pytest.mark.slow
 def test_processes_record_what_batch_writes(tmp_path):
     """Renamed topics and old estimates in the recording included."""
@@ -97,4 +112,8 @@ def test_processes_record_what_batch_writes(tmp_path):
     batch.process(bag, tmp_path / "batch", remap={"fix": "/gps/fix"})
     pipeline.run(bag, out, remap={"fix": "/gps/fix"}, show=False)
     assert_same(tmp_path / "batch", out, ["/imu/data", "/smoother/odometry", "/smoother/imu",
-                                          "/smoother/fix", "/smoother/path"])
+                                          "/smoother/fix", "/smoother/path",
+                                          "/smoother/results"])
+    found = [json.loads((path / "results.json").read_text())["smoother"]
+             for path in (tmp_path / "batch", out)]
+    assert found[0] == found[1] and found[0]["samples"] == 400 and found[0]["remarks"] == []

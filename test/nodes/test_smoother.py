@@ -2,22 +2,26 @@
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry, Path
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from imu_fusion import batch
-from imu_fusion.errors import EstimationError
+from imu_fusion.errors import EstimationError, LayoutError
 from imu_fusion.messages.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
-from imu_fusion.messages.smoothing import OUTPUTS, Collection, newest_epoch
+from imu_fusion.messages.smoothing import (
+    OUTPUTS, RESULTS_TOPIC, Collection, newest_epoch, results_value)
+from imu_fusion.nodes.flow import END, FlowSink, reliable_qos
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
 from test.nodes.conftest import START, STEP, collector
 
 TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix": NavSatFix,
-          "/smoother/path": Path}
+          "/smoother/path": Path, "/smoother/results": DiagnosticArray}
 
 
 def write(path, count=600):
@@ -42,6 +46,8 @@ def write(path, count=600):
 
 
 def fields(topic, cdr):
+    if topic == f"/{RESULTS_TOPIC}":
+        return results_value(cdr)
     layout = LAYOUTS.get(OUTPUTS[topic.lstrip("/")])
     if layout is None:
         return bytes(cdr)  # a Path has no padding: strings end on the boundary of stamps
@@ -69,6 +75,48 @@ def test_service_smooths_what_was_played_and_equals_batch(graph, tmp_path):
     # It did go east: the last odometry is at 0.5 * 3.99^2 m.
     values = LAYOUTS["nav_msgs/msg/Odometry"].decode(sink.messages["/smoother/odometry"][-1])[2]
     assert values[0] == pytest.approx(0.5 * 3.99 ** 2, abs=0.5)
+
+
+def test_who_comes_late_gets_all_of_the_last_result_and_nothing_else(graph, tmp_path):
+    """Volatile and latched subscribers there before, a latched one and a sink after two runs."""
+    bag = write(tmp_path / "bag", count=1500)
+    smoother = graph.start(SmootherNode, qos="reliable")
+    early = graph.node("early")
+    stamps = {"early": [], "late": []}
+
+    def listen(node, name, durability):
+        node.create_subscription(
+            Odometry, "/smoother/odometry",
+            lambda m: stamps[name].append(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec),
+            QoSProfile(depth=5000, durability=durability,
+                       reliability=ReliabilityPolicy.RELIABLE))
+
+    listen(early, "early", DurabilityPolicy.VOLATILE)
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
+    graph.until(lambda: replayer.finished)
+    node = graph.node("client")
+    for run in (1, 2):
+        assert graph.call(node, Trigger, "/smoother/smooth", timeout=120.0).success
+        graph.until(lambda: smoother._messages is smoother._result is None)
+        graph.until(lambda: len(stamps["early"]) == run * 1500)
+    late = graph.node("late")
+    listen(late, "late", DurabilityPolicy.TRANSIENT_LOCAL)
+    graph.until(lambda: len(stamps["late"]) >= 1500)
+    assert stamps["late"] == [START + i * STEP for i in range(1500)]
+    # A sink that has heard the old publisher counts the new one from its beginning.
+    heard, ended = [], []
+    sink = FlowSink(graph.node("sink"), on_end=lambda session: ended.append(session.event))
+    inbox = sink.subscribe(Odometry, "/smoother/odometry", lambda cdr, _: heard.append(cdr),
+                           reliable_qos(5000, DurabilityPolicy.TRANSIENT_LOCAL))
+    graph.until(lambda: len(heard) == 1500)
+    assert graph.call(node, Trigger, "/smoother/smooth", timeout=120.0).success
+    graph.until(lambda: ended)
+    assert len(heard) == 3000 and ended == [END] and not inbox.lost
+
+
+def test_a_bad_surface_ends_the_node_at_its_start(graph):
+    with pytest.raises(LayoutError, match="nowhere"):
+        graph.start(SmootherNode, surface="nowhere")
 
 
 def test_without_samples_the_answer_is_no_with_the_reason(graph):

@@ -133,6 +133,15 @@ def test_constant_states_are_a_table_and_wandering_ones_a_figure(smoothed):
     assert "GNSS position error" in notes and "magnetometer bias" not in notes
 
 
+def test_a_single_pass_is_not_called_converged(smoothed):
+    states = []
+    for converged in (True, False, None):
+        result = replace(smoothed.result, converged=converged)
+        (state,) = [n.note for n in report.smoother_numbers(result) if n.label == "Iterations"]
+        states.append((state, "iterations (" in result.summary()))
+    assert states == [("converged", True), ("NOT CONVERGED", True), ("single pass", False)]
+
+
 def test_report_from_the_command_line_is_bounded_and_refusals_are_told(tmp_path):
     out = tmp_path / "r.html"
     result = CliRunner().invoke(cli.cli, ["report", str(BAG), "--params-file", str(PARAMS),

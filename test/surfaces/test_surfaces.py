@@ -6,13 +6,17 @@ import pytest
 from imu_fusion.errors import ImuFusionError, LayoutError
 from imu_fusion.surface_file import load_surface, surface_from_mapping
 from imu_fusion.surfaces.fis_hill import FisHill
+from imu_fusion.surfaces.profile import Arc, Line, Profile
 
 ORIGIN = {"latitude": 47.4, "longitude": 10.3, "height": 900.0}
+HS106 = dict(w=95, h=44.93, n=83.07, gamma_deg=35, alpha_deg=11, e=89, es=20.7, gates=42, t=6.5,
+             r1=95, s=2.2, betaP_deg=37, beta_deg=34.5, betaL_deg=32, rL=220, r2L=106.5, r2=106.5)
 HILLS = {
-    "hs106": FisHill(),
-    "hs137": FisHill(w=120, h=59.52, n=103.51, e=99.5, es=27, gates=54, r1=115, s=3.38,
-                     betaP_deg=37.43, beta_deg=35.5, betaL_deg=33.56, rL=321, r2L=100, r2=100),
-    "circles": FisHill(in_run_curve="circle", out_run_curve="circle"),
+    "hs106": FisHill(**HS106),
+    "hs137": FisHill(w=120, h=59.52, n=103.51, gamma_deg=35, alpha_deg=11, e=99.5, t=6.5, r1=115,
+                     s=3.38, betaP_deg=37.43, beta_deg=35.5, betaL_deg=33.56, rL=321, r2L=100,
+                     r2=100),
+    "circles": FisHill(**HS106, in_run_curve="circle", out_run_curve="circle"),
 }
 
 
@@ -27,8 +31,28 @@ def test_joints_are_continuous_in_height_and_slope(name):
             assert abs(np.degrees(np.arctan(s1) - np.arctan(s0))) < 1e-4
 
 
+@pytest.mark.parametrize("after, radii, words", [
+    (Line(10.0, 5.0001, 0.5), {},
+     r"joint Q \(x = 10.000 m\): height z is 5.000000 m before and 5.000100 m after"),
+    (Line(10.0, 5.0, 0.6), {}, "joint Q .* slope is 26.56505 deg before and 30.96376 deg after"),
+    (Line(10.0, 5.0, np.nan), {}, "joint Q .* 5.000000 m before and nan m after"),
+    (Arc(10.0, 5.0, np.arctan(0.5), 90.0), {"Q": (np.inf, 95.0)},
+     "joint Q .* curvature after it is 0.01111111 1/m, the stated radius is 95 m"),
+    (Line(10.0, 5.0, 0.5), {"Q": (95.0, None)}, "joint Q .* curvature before it is -?0.0000"),
+])
+def test_a_joint_that_does_not_fit_is_named_with_its_figures(after, radii, words):
+    profile = Profile([10.0], [Line(0.0, 0.0, 0.5), after])
+    with pytest.raises(LayoutError, match=words):
+        profile.check_joints(["Q"], radii)
+
+
+def test_a_joint_that_fits_is_accepted():
+    arc = Arc(10.0, 5.0, np.arctan(0.5), 90.0)
+    Profile([10.0], [Line(0.0, 0.0, 0.5), arc]).check_joints(["Q"], {"Q": (np.inf, 90.0)})
+
+
 def test_radii_of_the_certificate_are_reproduced():
-    hill = FisHill()
+    hill = FisHill(**HS106)
     in_run, points = hill.in_run()
     landing, ends = hill.landing()
 
@@ -47,7 +71,7 @@ def test_radii_of_the_certificate_are_reproduced():
 
 def test_points_of_oberstdorf_hs106():
     # Points evaluated independently from the transcribed certificate (rounded to mm).
-    hill = FisHill()
+    hill = FisHill(**HS106)
     points = {**hill.in_run()[1], **hill.landing()[1]}
     expected = {"E2": (-6.381, -1.240), "E1": (-64.702, -30.392), "B": (-66.771, -31.842),
                 "A": (-83.728, -43.715), "P": (75.280, 39.322), "L": (91.097, 50.193),
@@ -59,7 +83,7 @@ def test_points_of_oberstdorf_hs106():
 
 
 def test_second_derivative_matches_differences_of_the_slope():
-    hill = FisHill()
+    hill = FisHill(**HS106)
     for profile, low, high in ((hill.in_run()[0], -80, 5), (hill.landing()[0], -5, 160)):
         x = np.linspace(low, high, 87) + 1e-3
         step = 1e-5
@@ -69,11 +93,11 @@ def test_second_derivative_matches_differences_of_the_slope():
 
 def test_certificate_contradictions_are_refused():
     with pytest.raises(LayoutError, match="gamma"):
-        FisHill(gamma_deg=10, alpha_deg=11)
+        FisHill(**{**HS106, "gamma_deg": 10})
     with pytest.raises(LayoutError, match="fall from P"):
-        FisHill(betaL_deg=36)
+        FisHill(**{**HS106, "betaL_deg": 36})
     with pytest.raises(LayoutError, match="gates 1 to 42"):
-        FisHill().gate(43)
+        FisHill(**HS106).gate(43)
 
 
 def _check_gradients(surface, positions):
@@ -109,7 +133,7 @@ def test_hill_constraints_in_the_world():
 
 
 def test_surveyed_table_reproduces_the_norm_profile():
-    hill = FisHill()
+    hill = FisHill(**HS106)
     xi, xl = np.linspace(-85, 0, 86), np.linspace(0, 160, 161)
     table = {"type": "hill_table", "origin": ORIGIN, "azimuth_deg": 90.0, "w": 95, "n": 83.07,
              "in_run": np.column_stack([xi, hill.in_run()[0](xi)[0]]).tolist(),
@@ -122,7 +146,7 @@ def test_surveyed_table_reproduces_the_norm_profile():
     assert [c.sigma for c in surface.constraints()] == [0.05, 0.1, 0.2]
     assert surface.jump_length(83.07) == pytest.approx(95.0)
     table["landing"][3][0] = 0.0
-    with pytest.raises(LayoutError, match="landing: x must increase"):
+    with pytest.raises(LayoutError, match="'landing': x must increase, point 4"):
         surface_from_mapping(table)
 
 

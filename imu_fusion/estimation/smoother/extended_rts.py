@@ -7,17 +7,27 @@ measurement: states (40), parameters (42), inputs (41), outputs (48)-(50), const
 table 4 is that of one sample, held over the sample.
 
 Frames are those of the paper: position in the hill frame N (x forward, z down), velocity in
-body axes, quaternion (w, x, y, z) of the body against north-east-down.
+body axes, quaternion (w, x, y, z) of the body against north-east-down (O); magnetic
+quantities in microtesla.
+
+Memory: a filtered covariance, a predicted one and a transition matrix of every sample are
+11.6 kB. So the filter keeps its state at the first of every ``_SEGMENT`` samples only, and
+the pass back filters each segment once more; the operations are the same and so the numbers.
 """
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.events import detect_jump, jump_result
+from imu_fusion.estimation.events import find_jump, jump_result
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors
-from imu_fusion.estimation.smoother.inputs import prepare_imu, reference_frame
-from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
+from imu_fusion.estimation.smoother.inputs import (holds, prepare_imu, prepare_measurements,
+                                                   reference_frame)
+from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
+from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult, reading_variances
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import hill_axes
 from imu_fusion.geometry.gravity import normal_gravity
@@ -27,14 +37,18 @@ from imu_fusion.surfaces.hill import Hill
 _R, _V, _Q = slice(0, 3), slice(3, 6), slice(6, 10)
 _DW, _DA, _DM, _DS = slice(10, 13), slice(13, 16), slice(16, 19), slice(19, 22)
 _N = 22
-_SERIES = 6  # terms of (7)-(9); the next is below 1e-12 at 100 Hz
+_SERIES = 10    # terms of (7)-(9): the next is w^10 / 10!, 1e-11 where w = |rate| dt is 0.35
+_SEGMENT = 64   # samples kept at once on the way back
+_EYE = np.eye(3)
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
-# Tables 3 and 5; magnetic quantities in microtesla.
+# Tables 3 and 5.
 _P0 = np.square([5, 5, 15, 1, 1, 3, *[0.1] * 4, *[0.0873] * 3, *[0.2] * 3, *[5.0] * 3,
                  *[0.1] * 3])
-_R_FIX, _R_VEL, _R_MAG = np.square([3, 3, 5.0]), np.square([0.1, 0.1, 0.3]), np.full(3, 25.0)
+_R_READING = {FIX: np.square([3, 3, 5.0]), VELOCITY: np.square([0.1, 0.1, 0.3]),
+              MAG: np.full(3, 25.0)}
 _R_NORM = 0.01 ** 2
+_NAMES = {FIX: "fix", VELOCITY: "velocity", MAG: "mag"}
 
 
 def _skew(v):
@@ -44,14 +58,16 @@ def _skew(v):
 def _to_ned(q):
     """M_BO transposed (47), without normalisation, as the derivatives need it."""
     w, v = q[0], q[1:]
-    return (w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * _skew(v)
+    return (w * w - v @ v) * _EYE + 2.0 * v[:, None] * v + 2.0 * w * _skew(v)
 
 
 def _d_to_ned(q, u):
     """Derivative (3, 4) of M_BO' u by q."""
     w, v = q[0], q[1:]
-    return 2.0 * np.column_stack([w * u + np.cross(v, u), (v @ u) * np.eye(3) + np.outer(v, u)
-                                  - np.outer(u, v) - w * _skew(u)])
+    out = np.empty((3, 4))
+    out[:, 0] = w * u + _skew(v) @ u
+    out[:, 1:] = (v @ u) * _EYE + v[:, None] * u - u[:, None] * v - w * _skew(u)
+    return 2.0 * out
 
 
 def _d_to_body(q, u):
@@ -62,205 +78,375 @@ def _d_to_body(q, u):
 
 def _rate_matrix(q):
     """The matrix of (46), (4, 3)."""
-    return np.vstack([-q[1:], q[0] * np.eye(3) + _skew(q[1:])])
+    w, x, y, z = q
+    return np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
 
 
-class ExtendedRts:
-    """Runs like :class:`~imu_fusion.estimation.smoother.Smoother`; takes noise of the inputs,
-    gravity and field from its parameters, all else from the paper."""
+def discretise(a, f, dt):
+    """Phi (7) and Gamma (9) of an interval by their series; with B for F, (8).
 
-    def __init__(self, params, surface):
-        self.params, self.surface = params, surface
+    Args:
+        a: (n, n) derivative of the state equations by the state. f: (n, k) by the noise. dt: s.
 
-    def run(self, imu, mag, fix, velocity, events=None):
-        """See Smoother.run. Needs a magnetometer, fixes and velocities.
+    Returns:
+        (n, n), (n, k).
+    """
+    term = np.eye(len(a))
+    phi, gamma = term.copy(), dt * term
+    for i in range(1, _SERIES):
+        term = term @ a * (dt / i)
+        phi += term
+        gamma += term * (dt / (i + 1))
+    return phi, gamma @ f
 
-        Raises:
-            EstimationError: a sensor is missing or the filter diverged.
-        """
-        if mag is None or velocity is None or not len(mag) or not len(velocity):
-            raise EstimationError("method extended_rts needs a magnetometer and GNSS velocities")
-        imu = prepare_imu(imu, self.params).log
-        frame = reference_frame(self.surface, fix)
-        hill = self.surface if isinstance(self.surface, Hill) else None
-        if hill is not None and events is None:
-            events = detect_jump(imu, velocity)
-        self.axes = hill.axes if hill is not None else hill_axes(0.0)
-        self.from_ned = self.axes @ _ENU_NED
-        gravity = self.params.gravity or normal_gravity(frame.latitude_deg, frame.height)
-        self.gravity_ned = np.array([0.0, 0.0, gravity])
-        field = self.params.magnetic_field
-        if field is None:
-            field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg, frame.height,
-                                         decimal_year(fix.stamp[0]))
-        self.field_ned = _ENU_NED @ np.asarray(field) * 1e6
 
-        readings = self._readings(imu, mag, fix, velocity, frame)
-        x0 = np.zeros(_N)
-        x0[_R] = readings["fix"][1][0]
-        attitude = Rotation.from_quat(attitude_from_vectors(
-            imu.acc[0], mag.mag[0], _ENU_NED @ self.field_ned)).as_matrix()
-        attitude = _ENU_NED @ attitude
-        x0[_Q] = np.roll(Rotation.from_matrix(attitude).as_quat(), 1)
-        x0[_V] = attitude.T @ readings["velocity"][1][0]
-        x, cov, cost = self._smooth(imu, readings, hill, events, x0)
-        if not np.isfinite(x).all():
-            raise EstimationError("extended_rts diverged")
-        samples = self._samples(imu, x, cov)
-        jump = jump_result(hill, samples, imu, events) if hill is not None else None
-        constraints = () if hill is None else hill.constraints()
-        fits = surface_fits(constraints, samples, {}, events, self.params)
-        return SmootherResult(samples, frame, {}, {}, (cost,), 1, True, events, jump, fits)
+@dataclass(frozen=True)
+class Model:
+    """State, output and constraint equations (44)-(51) and their derivatives.
 
-    def _readings(self, imu, mag, fix, velocity, frame):
-        """Kind -> (sample of each reading, values); readings go to the nearest sample."""
-        def nearest(stamp):
-            middle = imu.stamp[:-1] + np.diff(imu.stamp) // 2
-            return np.searchsorted(middle, stamp)
-        enu = frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
-        return {"fix": (nearest(fix.stamp), enu @ self.axes.T),
-                "velocity": (nearest(velocity.stamp), velocity.vel_world @ _ENU_NED.T),
-                "mag": (nearest(mag.stamp), mag.mag * 1e6)}
+    ``axes`` (3, 3): R_hill_world. ``gravity_ned`` (3,) m/s^2, ``field_ned`` (3,) microtesla.
+    ``hill``: Hill or None. A state x (22,) is position, velocity, quaternion (40) and the
+    biases of gyroscope, accelerometer, magnetometer and its scale errors (42).
+    """
 
-    def _rate(self, x, u):
-        """The state equations (44)-(46); parameters stand still."""
+    axes: np.ndarray
+    gravity_ned: np.ndarray
+    field_ned: np.ndarray
+    hill: object = None
+
+    @cached_property
+    def to_hill(self):
+        """M_NO (31), (3, 3)."""
+        return self.axes @ _ENU_NED
+
+    def rate(self, x, u):
+        """The state equations (44)-(46) for inputs u (6,); parameters stand still (22)."""
         omega, force = u[:3] - x[_DW], u[3:] - x[_DA]
         to_ned = _to_ned(x[_Q])
         rate = np.zeros(_N)
-        rate[_R] = self.from_ned @ (to_ned @ x[_V])
-        rate[_V] = force + to_ned.T @ self.gravity_ned - np.cross(omega, x[_V])
+        rate[_R] = self.to_hill @ (to_ned @ x[_V])
+        rate[_V] = force + to_ned.T @ self.gravity_ned - _skew(omega) @ x[_V]
         rate[_Q] = 0.5 * _rate_matrix(x[_Q]) @ omega
         return rate
 
-    def _jacobians(self, x, u):
+    def jacobians(self, x, u):
+        """Derivatives of :meth:`rate`: A (22, 22) by the state, F (22, 6) by the noise (43)."""
         omega = u[:3] - x[_DW]
         a, f = np.zeros((_N, _N)), np.zeros((_N, 6))
-        a[_R, _V] = self.from_ned @ _to_ned(x[_Q])
-        a[_R, _Q] = self.from_ned @ _d_to_ned(x[_Q], x[_V])
+        a[_R, _V] = self.to_hill @ _to_ned(x[_Q])
+        a[_R, _Q] = self.to_hill @ _d_to_ned(x[_Q], x[_V])
         a[_V, _V] = -_skew(omega)
         a[_V, _Q] = _d_to_body(x[_Q], self.gravity_ned)
         a[_V, _DW] = -_skew(x[_V])
-        a[_V, _DA] = -np.eye(3)
-        a[_Q, _Q] = 0.5 * np.block([[0.0, -omega[None, :]], [omega[:, None], -_skew(omega)]])
+        a[_V, _DA] = -_EYE
+        a[6, 7:10], a[7:10, 6], a[7:10, 7:10] = -omega, omega, -_skew(omega)
+        a[_Q, _Q] *= 0.5
         a[_Q, _DW] = -0.5 * _rate_matrix(x[_Q])
         f[:, :3], f[:, 3:] = a[:, _DW], a[:, _DA]
         return a, f
 
-    def _predict(self, x, cov, u0, u1, dt, q):
-        """Equations (12), (13) with (7)-(9): RK4 with linearly interpolated inputs."""
-        a, f = self._jacobians(x, u0)
-        phi, gamma, term = np.eye(_N), np.eye(_N) * dt, np.eye(_N)
-        for i in range(1, _SERIES):
-            term = term @ a * (dt / i)
-            phi = phi + term
-            gamma = gamma + term * (dt / (i + 1))
-        gamma = gamma @ f
+    def predict(self, x, cov, u0, u1, dt, q):
+        """Equations (12), (13): Runge-Kutta with inputs that go linearly from u0 to u1.
+
+        Args:
+            x, cov: filtered state (22,) and covariance (22, 22). u0, u1: (6,) rad/s, m/s^2.
+            dt: s. q: (6,) variances of one sample of the inputs.
+
+        Returns:
+            State, covariance, Phi.
+        """
+        phi, gamma = discretise(*self.jacobians(x, u0), dt)
         middle = 0.5 * (u0 + u1)
-        k1 = self._rate(x, u0)
-        k2 = self._rate(x + 0.5 * dt * k1, middle)
-        k3 = self._rate(x + 0.5 * dt * k2, middle)
-        k4 = self._rate(x + dt * k3, u1)
+        k1 = self.rate(x, u0)
+        k2 = self.rate(x + 0.5 * dt * k1, middle)
+        k3 = self.rate(x + 0.5 * dt * k2, middle)
+        k4 = self.rate(x + dt * k3, u1)
         return (x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4),
                 phi @ cov @ phi.T + (gamma * q) @ gamma.T, phi)
 
-    def _rows(self, x, k, latest, hill, phase):
-        """Innovation, derivative and variances of the readings and constraints at sample k."""
-        innovation, jacobian, variance = [], [], []
+    def output(self, kind, x):
+        """Reading of a kind (FIX, VELOCITY, MAG) as predicted (3,) by (48)-(50) and its
+        derivative (3, 22): m in the hill frame, m/s north-east-down, microtesla in body axes."""
+        h = np.zeros((3, _N))
+        if kind == FIX:
+            h[:, _R] = _EYE
+            return x[_R], h
         to_ned = _to_ned(x[_Q])
-
-        def add(value, rows, r):
-            innovation.append(np.atleast_1d(value))
-            jacobian.append(rows)
-            variance.append(np.atleast_1d(r))
-
-        if k in latest["fix"]:
-            h = np.zeros((3, _N))
-            h[:, _R] = np.eye(3)
-            add(latest["fix"][k] - x[_R], h, _R_FIX)
-        if k in latest["velocity"]:
-            h = np.zeros((3, _N))
+        if kind == VELOCITY:
             h[:, _V], h[:, _Q] = to_ned, _d_to_ned(x[_Q], x[_V])
-            add(latest["velocity"][k] - to_ned @ x[_V], h, _R_VEL)
-        if k in latest["mag"]:
-            scale, body = 1.0 + x[_DS], to_ned.T @ self.field_ned
-            h = np.zeros((3, _N))
-            h[:, _Q] = scale[:, None] * _d_to_body(x[_Q], self.field_ned)
-            h[:, _DM], h[:, _DS] = np.eye(3), np.diag(body)
-            add(latest["mag"][k] - (scale * body + x[_DM]), h, _R_MAG)
-        h = np.zeros((1, _N))
+            return to_ned @ x[_V], h
+        scale, body = 1.0 + x[_DS], to_ned.T @ self.field_ned
+        h[:, _Q] = scale[:, None] * _d_to_body(x[_Q], self.field_ned)
+        h[:, _DM], h[:, _DS] = _EYE, np.diag(body)
+        return scale * body + x[_DM], h
+
+    def constraints(self, x, names):
+        """The norm and those of the hill's constraints that are named, (51): name -> (value,
+        derivative (22,)), m, of the quaternion without unit."""
         norm = np.linalg.norm(x[_Q])
-        h[0, _Q] = x[_Q] / norm
-        add(1.0 - norm, h, _R_NORM)
-        if phase is not None:
-            profile = hill.in_run if phase == "in_run" else hill.landing
-            sigma = {c.name: c.sigma for c in hill.constraints()}
+        h = np.zeros(_N)
+        h[_Q] = x[_Q] / norm
+        rows = {"norm": (norm - 1.0, h)}
+        for name in names:
+            h = np.zeros(_N)
+            if name == "in_run_lateral":
+                h[1] = 1.0
+                rows[name] = (x[1], h)
+                continue
+            profile = self.hill.in_run if name == "in_run" else self.hill.landing
             z, slope, _ = profile(x[0])
-            h = np.zeros((1, _N))
-            h[0, 0], h[0, 2] = -slope, 1.0
-            add(float(z - x[2]), h, sigma[phase] ** 2)
-            if phase == "in_run":
-                h = np.zeros((1, _N))
-                h[0, 1] = 1.0
-                add(-x[1], h, sigma["in_run_lateral"] ** 2)
-        return np.concatenate(innovation), np.vstack(jacobian), np.concatenate(variance)
+            h[0], h[2] = -slope, 1.0
+            rows[name] = (x[2] - z, h)
+        return rows
 
-    def _smooth(self, imu, readings, hill, events, x):
-        n = len(imu)
-        inputs, steps = np.concatenate([imu.gyr, imu.acc], axis=1), np.diff(imu.stamp) * 1e-9
-        p = self.params
-        latest = {kind: dict(zip(sample.tolist(), value))
-                  for kind, (sample, value) in readings.items()}
-        cov, cost = np.diag(_P0), 0.0
-        predicted, filtered = np.empty((n, _N)), np.empty((n, _N))
-        cov_predicted, cov_filtered = np.empty((n, _N, _N)), np.empty((n, _N, _N))
-        transition = np.empty((n, _N, _N))
-        for k in range(n):
-            if k:
-                # The density, as the standard deviation of one sample held over the step.
-                q = np.repeat([p.gyro_noise_density ** 2, p.acc_noise_density ** 2],
-                              3) / steps[k - 1]
-                x, cov, transition[k - 1] = self._predict(x, cov, inputs[k - 1], inputs[k],
-                                                          steps[k - 1], q)
-            predicted[k], cov_predicted[k] = x, cov
-            phase = None
-            if hill is not None and imu.stamp[k] <= events.takeoff:
-                phase = "in_run"
-            elif hill is not None and imu.stamp[k] >= events.touchdown:
-                phase = "landing"
-            innovation, h, r = self._rows(x, k, latest, hill, phase)
-            spread = h @ cov @ h.T + np.diag(r)
-            gain = np.linalg.solve(spread, h @ cov).T
-            cost += 0.5 * float(innovation @ np.linalg.solve(spread, innovation))
-            x = x + gain @ innovation
-            cov = cov - gain @ (h @ cov)
-            cov = 0.5 * (cov + cov.T)
-            filtered[k], cov_filtered[k] = x, cov
-        smoothed, cov_smoothed = filtered, cov_filtered
-        for k in range(n - 2, -1, -1):  # (19)-(21)
-            gain = np.linalg.solve(cov_predicted[k + 1],
-                                   transition[k] @ cov_filtered[k]).T
-            smoothed[k] = filtered[k] + gain @ (smoothed[k + 1] - predicted[k + 1])
-            cov_smoothed[k] = cov_filtered[k] + gain @ (cov_smoothed[k + 1]
-                                                        - cov_predicted[k + 1]) @ gain.T
-        return smoothed, cov_smoothed, cost
 
-    def _samples(self, imu, x, cov):
-        """The paper's states in the conventions of this package."""
-        samples = np.empty(len(x), SAMPLE)
-        samples["stamp"] = imu.stamp
-        samples["position_world"] = x[:, _R] @ self.axes
-        samples["cov_position"] = self.axes.T @ cov[:, _R, _R] @ self.axes
-        for k, (xk, ck) in enumerate(zip(x, cov)):
-            q = xk[_Q] / np.linalg.norm(xk[_Q])
-            to_enu = _ENU_NED @ _to_ned(q)
-            samples["vel_world"][k] = to_enu @ xk[_V]
-            h = np.column_stack([to_enu, _ENU_NED @ _d_to_ned(q, xk[_V])])
-            samples["cov_velocity"][k] = h @ ck[3:10, 3:10] @ h.T
-            samples["quat_world_imu"][k] = Rotation.from_matrix(to_enu).as_quat()
-            local = 2.0 * _rate_matrix(q).T  # dq = 1/2 Omega(q) dtheta, inverted
-            samples["cov_attitude"][k] = local @ ck[_Q, _Q] @ local.T
-        samples["gyr_bias"], samples["acc_bias"] = x[:, _DW], x[:, _DA]
-        samples["gyr"], samples["acc"] = imu.gyr - x[:, _DW], imu.acc - x[:, _DA]
-        sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))
-        samples["gyr_bias_sd"], samples["acc_bias_sd"] = sd[:, _DW], sd[:, _DA]
-        return samples
+@dataclass(frozen=True)
+class _Data:
+    """Of a recording: stamps (N,) ns, inputs (N, 6), steps (N - 1,) s and variance densities
+    (N - 1, 6) of the intervals; order of the readings used, start (N + 1,) of those of each
+    sample among them, kinds and values (m, 3); by name of the constraint, mask (N,) of the samples
+    where one of the hill's is active, and sigma."""
+
+    stamp: np.ndarray
+    inputs: np.ndarray
+    steps: np.ndarray
+    noise: np.ndarray
+    order: np.ndarray
+    start: np.ndarray
+    kind: np.ndarray
+    value: np.ndarray
+    active: dict
+    sigma: dict
+
+
+class ExtendedRts:
+    """Runs like :class:`~imu_fusion.estimation.smoother.Smoother`. Takes noise and ranges of the
+    inputs, gravity, field, events, windows and the choice of readings (``gnss_even_stamps``,
+    ``gnss_min_interval``) from its parameters, all else from the paper: tables 3 and 5 rather
+    than the covariances of fixes and velocities. Clipped readings are used as they are, with the
+    noise of unknown ones.
+    """
+
+    def __init__(self, params, surface):
+        self.params, self.surface = params, surface
+
+    def run(self, imu, mag, fix, velocity, events=None, initial_quat=None):
+        """See Smoother.run. Needs a magnetometer, fixes and velocities.
+
+        ``cost`` of the result is half the sum of squares of all normalised innovations,
+        constraints included, in the one pass there is; ``converged`` is None.
+
+        Raises:
+            EstimationError: a sensor is missing, the surface is no hill or the filter diverged.
+            SampleError: unusable samples.
+        """
+        params, hill = self.params, self.surface
+        if hill is not None and not isinstance(hill, Hill):
+            raise EstimationError("method extended_rts knows hills only, no "
+                                  f"{type(hill).__name__} (method: iterated)")
+        prepared = prepare_imu(imu, params)
+        frame = reference_frame(hill, fix)
+        if hill is not None and events is None:
+            events = find_jump(prepared.log, velocity, params.takeoff, params.touchdown)
+        measurements = prepare_measurements(frame, mag, fix, velocity, params)
+        gravity, field = params.gravity, params.magnetic_field
+        if gravity is None:
+            gravity = float(normal_gravity(frame.latitude_deg, frame.height))
+        if field is None:
+            field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg, frame.height,
+                                         decimal_year(fix.stamp[0]))
+        model = Model(hill.axes if hill is not None else hill_axes(0.0),
+                      np.array([0.0, 0.0, gravity]), _ENU_NED @ np.asarray(field) * 1e6, hill)
+        data = _bind(model, prepared, measurements, events, params)
+        try:
+            samples, mag_errors, mag_sd, innovation, cost = _smooth(
+                model, data, _first_state(model, data, initial_quat))
+        except np.linalg.LinAlgError:
+            raise EstimationError(
+                "extended_rts diverged: noise far below that of the data, or measurements of "
+                "another recording") from None
+        if not prepared.recorded.all():
+            samples, mag_errors, mag_sd = (v[prepared.recorded]
+                                           for v in (samples, mag_errors, mag_sd))
+        noise = reading_variances(samples["stamp"], params)
+        lost = noise * np.square([params.unknown_gyro_density / params.gyro_noise_density,
+                                  params.unknown_acc_density / params.acc_noise_density])
+        for i, name in enumerate(("gyr", "acc")):
+            clipped = prepared.clipped[prepared.recorded, 3 * i:3 * i + 3]
+            samples[name + "_sd"] = np.sqrt(samples[name + "_bias_sd"] ** 2
+                                            + np.where(clipped, lost[i], noise[i]))
+        states = {"mag_bias": (1e-6 * mag_errors[:, :3], 1e-6 * mag_sd[:, :3]),
+                  "mag_scale": (mag_errors[:, 3:], mag_sd[:, 3:])}
+        stamps = measurements.stamp[data.order]
+        innovations = {name: (stamps[data.kind == kind], innovation[data.kind == kind])
+                       for kind, name in _NAMES.items()}
+        jump = jump_result(hill, samples, prepared.log, events) if hill is not None else None
+        constraints = () if hill is None else hill.constraints()
+        fits = surface_fits(constraints, samples, states, events, params)
+        return SmootherResult(samples, frame, states, innovations, (cost,), 1, None, events, jump,
+                              fits)
+
+
+def _bind(model, prepared, measurements, events, params):
+    """The recording as :class:`_Data`: readings within the Imu's span at their nearest samples,
+    in the frames of the outputs (48).
+
+    The paper has one reading of a kind at a sample at most; of two, each is a measurement of
+    that sample.
+
+    Raises:
+        EstimationError: a kind of reading is missing.
+    """
+    log = prepared.log
+    inside = (measurements.stamp >= log.stamp[0]) & (measurements.stamp <= log.stamp[-1])
+    middle = log.stamp[:-1] + np.diff(log.stamp) // 2
+    sample = np.searchsorted(middle, measurements.stamp)
+    order = np.lexsort((measurements.stamp, measurements.kind, sample))
+    order = order[inside[order]]
+    kind, value = measurements.kind[order], measurements.value[order]
+    if not np.any(kind == FIX):
+        raise EstimationError("no fix lies within the Imu recording: do the stamps belong "
+                              "together?")
+    if not (np.any(kind == VELOCITY) and np.any(kind == MAG)):
+        raise EstimationError("method extended_rts needs a magnetometer and GNSS velocities")
+    value[kind == FIX] = value[kind == FIX] @ model.axes.T
+    value[kind == VELOCITY] = value[kind == VELOCITY] @ _ENU_NED.T
+    constraints = model.hill.constraints() if model.hill is not None else ()
+    strict = params.replace(event_margin=0.0)
+    active = {c.name: holds(c, log.stamp, events, strict) for c in constraints}
+    sigma = {"norm": np.sqrt(_R_NORM), **{c.name: c.sigma for c in constraints}}
+    return _Data(log.stamp, np.concatenate([log.gyr, log.acc], axis=1), prepared.steps,
+                 prepared.noise, order, np.searchsorted(sample[order], np.arange(len(log) + 1)),
+                 kind, value, active, sigma)
+
+
+def _first_state(model, data, quat_world_imu):
+    """x (22,) of section 4.1: first fix, velocity, and the attitude from the first force and
+    field unless one is given."""
+    fix, velocity, mag = (data.value[data.kind == kind][0] for kind in (FIX, VELOCITY, MAG))
+    if quat_world_imu is None:
+        quat_world_imu = attitude_from_vectors(data.inputs[0, 3:], mag,
+                                               _ENU_NED @ model.field_ned)
+    attitude = _ENU_NED @ Rotation.from_quat(quat_world_imu).as_matrix()
+    x = np.zeros(_N)
+    x[_R], x[_V] = fix, attitude.T @ velocity
+    x[_Q] = np.roll(Rotation.from_matrix(attitude).as_quat(), 1)
+    return x
+
+
+def _update(model, data, k, x, cov):
+    """Equations (14)-(16), (24) with all readings and constraints of sample k.
+
+    Returns:
+        State and covariance; the innovations, each by its standard deviation given those before
+        it: readings first.
+    """
+    innovation, jacobian, variance = [], [], []
+    for i in range(data.start[k], data.start[k + 1]):
+        predicted, h = model.output(data.kind[i], x)
+        innovation.extend(data.value[i] - predicted)
+        jacobian.extend(h)
+        variance.extend(_R_READING[data.kind[i]])
+    active = [name for name, mask in data.active.items() if mask[k]]
+    for name, (value, h) in model.constraints(x, active).items():
+        innovation.append(-value)
+        jacobian.append(h)
+        variance.append(data.sigma[name] ** 2)
+    innovation, h = np.array(innovation), np.array(jacobian)
+    spread = h @ cov @ h.T + np.diag(variance)
+    gain = np.linalg.solve(spread, h @ cov).T
+    x = x + gain @ innovation
+    cov = cov - gain @ (h @ cov)
+    return x, 0.5 * (cov + cov.T), np.linalg.solve(np.linalg.cholesky(spread), innovation)
+
+
+def _filter(model, data, first, last, x, cov, innovation):
+    """Filter samples first <= k < last from the state and covariance predicted for ``first``;
+    writes the innovations (m, 3) of their readings.
+
+    Returns:
+        Of each sample: filtered state and covariance, and the prediction for the next with Phi
+        (None after the last of the recording). Half the sum of squared innovations.
+    """
+    trace, cost = [], 0.0
+    for k in range(first, last):
+        x, cov, normal = _update(model, data, k, x, cov)
+        begin, end = data.start[k], data.start[k + 1]
+        innovation[begin:end] = normal[:3 * (end - begin)].reshape(-1, 3)
+        cost += 0.5 * float(normal @ normal)
+        ahead = None
+        if k < len(data.stamp) - 1:
+            dt = data.steps[k]
+            # The density, as the variance of one sample held over the step.
+            ahead = model.predict(x, cov, data.inputs[k], data.inputs[k + 1], dt,
+                                  data.noise[k] / dt)
+        trace.append((x, cov, ahead))
+        if ahead is not None:
+            x, cov, _ = ahead
+    return trace, cost
+
+
+def _smooth(model, data, x):
+    """Both passes from the first state x.
+
+    Returns:
+        Samples (N,) of :data:`SAMPLE`; magnetometer bias (microtesla) and scale errors (N, 6) and
+        their standard deviations (N, 6); normalised innovations (m, 3); cost.
+
+    Raises:
+        LinAlgError: states that are not finite, or covariances that are none.
+    """
+    n = len(data.stamp)
+    bounds = [*range(0, n, _SEGMENT), n]
+    innovation, cov, cost, kept = np.empty((len(data.kind), 3)), np.diag(_P0), 0.0, []
+    for first, last in zip(bounds[:-1], bounds[1:]):
+        kept.append((first, last, x, cov))
+        trace, part = _filter(model, data, first, last, x, cov, innovation)
+        cost += part
+        if last < n:
+            x, cov, _ = trace[-1][2]
+    if not (np.isfinite(cost) and np.isfinite(trace[-1][0]).all()):
+        raise np.linalg.LinAlgError
+    samples, mag, mag_sd = np.empty(n, SAMPLE), np.empty((n, 6)), np.empty((n, 6))
+    for first, last, x0, cov0 in reversed(kept):
+        trace, _ = _filter(model, data, first, last, x0, cov0, innovation)
+        states, covs = np.empty((last - first, _N)), np.empty((last - first, _N, _N))
+        for i in range(last - first - 1, -1, -1):
+            filtered, cov_filtered, ahead = trace[i]
+            if ahead is None:  # (17), (18)
+                x, cov = filtered, cov_filtered
+            else:  # (19)-(21)
+                predicted, cov_predicted, phi = ahead
+                gain = np.linalg.solve(cov_predicted, phi @ cov_filtered).T
+                x = filtered + gain @ (x - predicted)
+                cov = cov_filtered + gain @ (cov - cov_predicted) @ gain.T
+            states[i], covs[i] = x, cov
+        if not np.isfinite(states).all():
+            raise np.linalg.LinAlgError
+        here = slice(first, last)
+        sd = np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
+        samples[here] = _samples(model, data.stamp[here], data.inputs[here], states, covs, sd)
+        mag[here], mag_sd[here] = states[:, 16:], sd[:, 16:]
+    return samples, mag, mag_sd, innovation, cost
+
+
+def _samples(model, stamp, inputs, x, cov, sd):
+    """Smoothed states (m, 22), their covariances and standard deviations in the conventions of
+    this package: structured array (:data:`SAMPLE`)."""
+    samples = np.empty(len(x), SAMPLE)
+    samples["stamp"] = stamp
+    samples["position_world"] = x[:, _R] @ model.axes
+    samples["cov_position"] = model.axes.T @ cov[:, _R, _R] @ model.axes
+    attitude = Rotation.from_matrix(_ENU_NED) * Rotation.from_quat(np.roll(x[:, _Q], -1, axis=1))
+    samples["vel_world"] = attitude.apply(x[:, _V])
+    samples["quat_world_imu"] = attitude.as_quat()
+    for sample, xk, ck in zip(samples, x, cov):
+        q = xk[_Q] / np.linalg.norm(xk[_Q])
+        h = _ENU_NED @ np.hstack([_to_ned(q), _d_to_ned(q, xk[_V])])
+        sample["cov_velocity"] = h @ ck[3:10, 3:10] @ h.T
+        local = 2.0 * _rate_matrix(q).T  # dq = 1/2 Omega(q) dtheta, inverted
+        sample["cov_attitude"] = local @ ck[_Q, _Q] @ local.T
+    samples["gyr_bias"], samples["acc_bias"] = x[:, _DW], x[:, _DA]
+    samples["gyr_bias_sd"], samples["acc_bias_sd"] = sd[:, _DW], sd[:, _DA]
+    samples["gyr"], samples["acc"] = inputs[:, :3] - x[:, _DW], inputs[:, 3:] - x[:, _DA]
+    return samples

@@ -11,30 +11,48 @@ from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import ImuLog
 
+_NO_FIX = ("no valid GNSS fix: position cannot be estimated. Orientation alone is the job of the "
+           "orientation estimator")
+_FAR = 50e3   # m from the origin of a surface, where its plane of axes no longer describes it
 _MICRO = 1e6  # magnetic states and rows are kept in microtesla, near one in size
 
 
 def reference_frame(surface, fix):
-    """The surface's frame, or one at the first valid fix."""
-    if surface is not None:
-        return surface.origin
-    valid = np.flatnonzero(fix.status >= 0) if fix is not None else ()
+    """The surface's frame, or one at the first valid fix.
+
+    Raises:
+        EstimationError: no valid fix, or the surface is elsewhere.
+    """
+    valid = np.flatnonzero(valid_fixes(fix)) if fix is not None else ()
     if not len(valid):
-        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
-                              "alone is the job of the orientation estimator")
+        raise EstimationError(_NO_FIX)
     i = valid[0]
-    return LocalFrame(float(fix.latitude_deg[i]), float(fix.longitude_deg[i]),
-                      float(fix.height[i]))
+    first = float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
+    if surface is None:
+        return LocalFrame(*first)
+    away = float(np.linalg.norm(surface.origin.to_enu(*first)))
+    if away > _FAR:
+        raise EstimationError(
+            f"the surface's origin is {away / 1e3:.0f} km from the first fix (latitude "
+            f"{first[0]:.5f}, longitude {first[1]:.5f}): the surface is not that of this "
+            "recording, or its origin is mistyped")
+    return surface.origin
+
+
+def valid_fixes(fix):
+    """Mask (m,) of the fixes of a FixLog that say where they are."""
+    return ((fix.status >= 0) & np.isfinite(fix.latitude_deg) & np.isfinite(fix.longitude_deg)
+            & np.isfinite(fix.height))
 
 
 @dataclass(frozen=True)
 class ImuInput:
-    """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped_gyr`` (N,) the
-    rates out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
+    """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped`` (N, 6) the rates
+    and forces out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
 
     log: ImuLog
     recorded: np.ndarray
-    clipped_gyr: np.ndarray
+    clipped: np.ndarray
     noise: np.ndarray
 
     @property
@@ -81,8 +99,7 @@ def prepare_imu(imu, params):
         columns = [np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v[:, i])
                                     for i in range(3)]) for v in (imu.gyr, imu.acc)]
         imu = ImuLog(stamp=stamp[order], gyr=columns[0], acc=columns[1], frame_id=imu.frame_id)
-    sides = []
-    clipped_gyr = np.zeros(len(imu), bool)
+    sides, clipped = [], []
     for values, limit, density, unknown in (
             (imu.gyr, params.gyro_range, params.gyro_noise_density, params.unknown_gyro_density),
             (imu.acc, params.acc_range, params.acc_noise_density, params.unknown_acc_density)):
@@ -90,11 +107,11 @@ def prepare_imu(imu, params):
         if limit > 0.0:
             # One part in a thousand below the limit: rounding of logged full-scale values.
             lost |= np.abs(values) >= 0.999 * limit
-            if values is imu.gyr:
-                clipped_gyr = lost.any(axis=1) & recorded
+        clipped.append(lost & recorded[:, None])
         either = lost[1:] | lost[:-1]
         sides.append(np.where(either, unknown, density) ** 2)
-    return ImuInput(imu, recorded, clipped_gyr, np.concatenate(sides, axis=1))
+    return ImuInput(imu, recorded, np.concatenate(clipped, axis=1),
+                    np.concatenate(sides, axis=1))
 
 
 @dataclass(frozen=True)
@@ -216,11 +233,9 @@ def prepare_measurements(frame, mag, fix, velocity, params):
     """
     parts = []
     if fix is not None:
-        fix = fix[(fix.status >= 0) & np.isfinite(fix.latitude_deg)
-                  & np.isfinite(fix.longitude_deg) & np.isfinite(fix.height)]
+        fix = fix[valid_fixes(fix)]
     if fix is None or len(fix) == 0:
-        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation "
-                              "alone is the job of the orientation estimator")
+        raise EstimationError(_NO_FIX)
     eye = np.eye(3)
     fix, stamp = _gnss_readings(fix, params)
     root = _covariances(fix.cov_enu, params.fix_sd, "the fixes")
@@ -274,6 +289,24 @@ def lever_gradient(start, gradient, quat_world_imu, lever_imu):
     return np.cross(lever, along), along
 
 
+def holds(constraint, stamp, events, params):
+    """Mask (N,) of the samples at which a constraint holds: its phase of a jump, and the windows.
+
+    Args: as of :func:`evaluate_constraints`.
+    """
+    late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
+    active = np.ones(len(stamp), bool)
+    if constraint.phase == "in_run":
+        active = stamp <= events.takeoff - late
+    elif constraint.phase == "landing":
+        active = stamp >= events.touchdown + late
+    if params.surface_windows:
+        # An odd number of bounds passed: inside of a window.
+        bounds = np.round(np.array(params.surface_windows) * 1e9).astype(np.int64)
+        active = active & (np.searchsorted(bounds, stamp - stamp[0], side="right") % 2 == 1)
+    return active
+
+
 def evaluate_constraints(constraints, position_world, stamp, events, params):
     """Rows of all constraints on the samples where they hold.
 
@@ -296,13 +329,7 @@ def evaluate_constraints(constraints, position_world, stamp, events, params):
     step = np.minimum(step, max(params.max_gap * 1e9, 1.5 * np.median(step)))
     share = np.sqrt(params.surface_interval * 1e9 / step)
     for constraint in constraints:
-        late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
-        active = np.ones(len(stamp), bool)
-        if constraint.phase == "in_run":
-            active = stamp <= events.takeoff - late
-        elif constraint.phase == "landing":
-            active = stamp >= events.touchdown + late
-        sample = np.flatnonzero(active)
+        sample = np.flatnonzero(holds(constraint, stamp, events, params))
         if not len(sample):
             continue
         residual, gradient = constraint.evaluate(position_world[sample])

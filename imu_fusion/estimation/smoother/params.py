@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from imu_fusion.errors import ParameterError
 from imu_fusion.parameters import Parameters, param
 
 
@@ -85,6 +86,15 @@ class SmootherParams(Parameters):
         0.01, doc="Time after which a deviation from the surface counts as a new one: sigma is that "
         "of rows so far apart, and what they say per second does not depend on the rate of the "
         "Imu. Longer: slower deviations, a weaker surface", unit="s", low=1e-4, high=100.0)
+    surface_windows: tuple[float, ...] = param(
+        (), doc="Times since the first Imu sample in which the surface holds, start and stop of "
+        "each window in turn; empty: always (hills: before take-off and after touch-down)",
+        unit="s", low=0.0)
+    takeoff: float | None = param(None, doc="Take-off from a hill, since the first Imu sample; "
+                                  "detected when unset, and refined in either case", unit="s",
+                                  low=0.0)
+    touchdown: float | None = param(None, doc="Touch-down on a hill, in the same way", unit="s",
+                                    low=0.0)
     event_margin: float = param(0.3, doc="Time around take-off and touch-down in which the body "
                                 "may leave the surface", unit="s", low=0.0)
 
@@ -103,3 +113,13 @@ class SmootherParams(Parameters):
                              "attitude (rad) moves by more", low=1e-9)
     cost_tolerance: float = param(0.05, doc="Converged as well when the cost (half a sum of squared "
                                   "standard deviations) changes by less", low=0.0)
+
+    def __post_init__(self):
+        super().__post_init__()
+        windows = self.surface_windows
+        if len(windows) % 2 or any(b <= a for a, b in zip(windows, windows[1:])):
+            raise ParameterError(f"parameter 'surface_windows': {list(windows)} s are not pairs of "
+                                 "start and stop that ascend")
+        if None not in (self.takeoff, self.touchdown) and self.touchdown <= self.takeoff:
+            raise ParameterError(f"parameter 'touchdown': {self.touchdown:g} s is not after the "
+                                 f"take-off at {self.takeoff:g} s")

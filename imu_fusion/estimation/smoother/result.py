@@ -10,11 +10,16 @@ SAMPLE = np.dtype([
     ("stamp", "i8"), ("position_world", "f8", 3), ("vel_world", "f8", 3),
     ("quat_world_imu", "f8", 4), ("acc", "f8", 3), ("gyr", "f8", 3), ("gyr_bias", "f8", 3),
     ("acc_bias", "f8", 3), ("cov_position", "f8", (3, 3)), ("cov_velocity", "f8", (3, 3)),
-    ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3)])
+    ("cov_attitude", "f8", (3, 3)), ("gyr_bias_sd", "f8", 3), ("acc_bias_sd", "f8", 3),
+    ("gyr_sd", "f8", 3), ("acc_sd", "f8", 3)])
 
 _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _MISFIT = 3.0
+# RMS of a single pass. Simulated jumps: 1.0 to 1.1 where the attitude is within 1 deg of the truth,
+# 1.7 where it is 6 deg off.
+_SINGLE_PASS = 1.3
 _EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
+_SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
 _CAUSES = {
@@ -26,17 +31,30 @@ _CAUSES = {
     "mag": "the field may be disturbed, or mag_sd, mag_bias_sd and mag_scale_sd too small"}
 
 
+def reading_variances(stamp, params):
+    """Variances (2,) of the noise in one sample of rate and of force, of the stated densities.
+
+    Args:
+        stamp: (n,) ns. params: SmootherParams.
+    """
+    rate = 1e9 / np.median(np.diff(stamp))
+    return rate * np.square([params.gyro_noise_density, params.acc_noise_density])
+
+
 @dataclass(frozen=True)
 class SmootherResult:
     """What the smoother found.
 
     ``samples``: structured array (:data:`SAMPLE`), one per usable Imu sample; ``acc`` and
-    ``gyr`` are corrected of the estimated errors, in the imu frame; ``cov_attitude`` is that
-    of the rotation vector in imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
+    ``gyr`` are corrected of the estimated errors, in the imu frame, and still carry the noise
+    of their sample: ``acc_sd`` and ``gyr_sd`` are of all of it. Where a reading was clipped,
+    they are those of the smoothed motion. ``cov_attitude`` is that of the rotation vector in
+    imu axes. ``states``: name -> (values (n, k), sd (n, k)) of the
     optional states, in SI units. ``innovations``: name -> (stamp (m,), normalised
     innovations (m, 3)), white with unit variance where the model is right.
     ``surface``: name of a constraint -> SurfaceFit.
-    ``cost``: of the trajectory before each step; ``iterations`` counts the steps.
+    ``cost``: of the trajectory before each step; ``iterations`` counts the steps;
+    ``converged``: None where the method passes once and so cannot tell.
     """
 
     samples: np.ndarray
@@ -45,7 +63,7 @@ class SmootherResult:
     innovations: dict
     cost: tuple
     iterations: int
-    converged: bool
+    converged: bool | None
     events: object = None
     jump: object = None
     surface: dict = field(default_factory=dict)
@@ -54,14 +72,28 @@ class SmootherResult:
         """One line."""
         jump = f", jump length {self.jump.length:.1f} m" if self.jump else ""
         state = "converged" if self.converged else "did not converge"
-        return (f"{len(self.samples)} samples, {self.iterations} iterations ({state}), "
-                f"cost {self.cost[-1]:.6g}{jump}")
+        steps = "a single pass" if self.converged is None else \
+            f"{self.iterations} iterations ({state})"
+        return f"{len(self.samples)} samples, {steps}, cost {self.cost[-1]:.6g}{jump}"
 
     def misfit(self):
         """Name -> typical size of its innovations, in standard deviations: 1 where the model is
         right. By the median, so that outliers do not count."""
         return {name: float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
                 for name, (_, values) in self.innovations.items() if len(values)}
+
+    def _astray(self):
+        """Name and RMS of the largest innovations of a single pass, None where all fit.
+
+        By the RMS: no iteration mends a wrong first attitude, and what it costs the first
+        seconds is lost in a median.
+        """
+        if self.converged is not None:
+            return None
+        rms = {name: float(np.sqrt(np.mean(values ** 2)))
+               for name, (_, values) in self.innovations.items() if len(values)}
+        name = max(rms, key=rms.get, default=None)
+        return (name, rms[name]) if name and rms[name] > _SINGLE_PASS else None
 
     def _beside(self):
         """Medians (3,) of the normalised innovations of fixes, None if they may be chance or no
@@ -76,9 +108,15 @@ class SmootherResult:
     def remarks(self):
         """What a user should know before trusting the result: texts."""
         texts = []
-        if not self.converged:
+        if self.converged is False:
             texts.append(f"the smoother did not converge in {self.iterations} iterations: take its "
                          "result as provisional")
+        astray = self._astray()
+        if astray is not None:
+            texts.append(f"the {astray[0]} innovations of the single pass have an RMS of "
+                         f"{astray[1]:.1f} standard deviations: it may have begun with a wrong "
+                         "attitude and kept to it, or the noise is another; method: iterated "
+                         "starts from several and repeats")
         for name, size in self.misfit().items():
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
@@ -90,6 +128,9 @@ class SmootherResult:
                          "standard deviations: the origin of the surface may be off, the sensor "
                          "ride above it (body_height) or the fixes wander (gnss_position_error_sd)")
         for name, fit in self.surface.items():
+            if fit.silent > _SILENT:
+                texts.append(f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of "
+                             "the samples that it should hold: its grid may end there")
             if fit.excess > _EXCESS:
                 texts.append(
                     f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "

@@ -4,15 +4,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.events import detect_jump, jump_result, refine_jump
+from imu_fusion.estimation.events import find_jump, jump_result, refine_jump
 from imu_fusion.estimation.smoother import initial, iterated, model
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
 from imu_fusion.estimation.smoother.inputs import (prepare_imu, prepare_measurements,
                                                    reference_frame)
 from imu_fusion.estimation.smoother.params import SmootherParams
-from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
+from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult, reading_variances
 from imu_fusion.estimation.smoother.surface_fit import at_surface, surface_fits
-from imu_fusion.geometry.gravity import earth_rate_world, normal_gravity
+from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
 from imu_fusion.surfaces.hill import Hill
 
@@ -38,7 +38,7 @@ class Smoother:
 
         Args:
             imu: ImuLog. mag: MagLog or None. fix: FixLog. velocity: VelocityLog or None.
-            events: JumpEvents, or None: detected when the surface needs them.
+            events: JumpEvents, or None: found by ``find_jump`` when the surface needs them.
             initial_quat: (4,) attitude of the first sample; found from the data when None.
 
         Returns:
@@ -51,12 +51,13 @@ class Smoother:
         """
         params, surface = self.params, self.surface
         if params.method == "extended_rts":
-            return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events)
+            return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events,
+                                                    initial_quat)
         prepared = prepare_imu(imu, params)
         frame = reference_frame(surface, fix)
         constraints = surface.constraints() if surface is not None else ()
         if events is None and any(c.phase != "always" for c in constraints):
-            events = detect_jump(prepared.log, velocity)
+            events = find_jump(prepared.log, velocity, params.takeoff, params.touchdown)
         measurements = prepare_measurements(frame, mag, fix, velocity, params)
         problem = self._problem(prepared, frame, measurements, constraints, fix)
         hill = surface if isinstance(surface, Hill) and events is not None else None
@@ -172,14 +173,20 @@ class Smoother:
             samples[name] = cov[:, block]
         samples["gyr_bias_sd"], samples["acc_bias_sd"] = sd[:, 0:3], sd[:, 3:6]
         gyr, acc = log.gyr[recorded], log.acc[recorded]
+        noise = np.sqrt(reading_variances(samples["stamp"], problem.params))
+        samples["gyr_sd"] = np.hypot(samples["gyr_bias_sd"], noise[0])
+        samples["acc_sd"] = np.hypot(samples["acc_bias_sd"], noise[1])
         samples["gyr"], samples["acc"] = gyr - x[:, 10:13], acc - x[:, 13:16]
         if layout[model.GYR_SCALE] >= 0:
             i = layout[model.GYR_SCALE] + 1
             samples["gyr"] += x[:, i:i + 3] * gyr
+            samples["gyr_sd"] = np.hypot(samples["gyr_sd"], sd[:, i - 10:i - 7] * gyr)
         if layout[model.ACC_MATRIX] >= 0:
             i = layout[model.ACC_MATRIX] + 1
             samples["acc"] += np.einsum("nij,nj->ni", x[:, i:i + 9].reshape(-1, 3, 3), acc)
-        _recover_rates(samples, problem, recorded)
+            spread = sd[:, i - 10:i - 1].reshape(-1, 3, 3) * acc[:, None, :]
+            samples["acc_sd"] = np.sqrt(samples["acc_sd"] ** 2 + (spread ** 2).sum(axis=2))
+        _recover_clipped(samples, problem)
         states = {}
         for block, (name, width) in enumerate(model.BLOCKS):
             if layout[block] >= 0:
@@ -205,13 +212,33 @@ def _positions(problem):
     return samples
 
 
-def _recover_rates(samples, problem, recorded):
-    """Where the gyroscope was clipped, the rate is that of the smoothed attitude."""
-    clipped = np.flatnonzero(problem.imu.clipped_gyr)
-    clipped = clipped[(clipped > 0) & (clipped < len(problem.x) - 1)]
-    if not len(clipped):
+def _recover_clipped(samples, problem):
+    """Where a reading was clipped, take that of the smoothed motion from sample to sample.
+
+    Its variance is that of the difference, as if the errors at the two ends had nothing in
+    common, or of what was assumed of the lost reading if that is less.
+    """
+    p, log, x = problem.params, problem.imu.log, problem.x
+    clipped = problem.imu.clipped
+    inner = np.flatnonzero(clipped.any(axis=1))
+    inner = inner[(inner > 0) & (inner < len(x) - 1)]
+    if not len(inner):
         return
-    attitude = Rotation.from_quat(problem.x[:, 6:10])
-    span = (problem.imu.log.stamp[clipped + 1] - problem.imu.log.stamp[clipped - 1]) * 1e-9
-    turn = (attitude[clipped - 1].inv() * attitude[clipped + 1]).as_rotvec()
-    samples["gyr"][np.cumsum(recorded)[clipped] - 1] = turn / span[:, None]
+    row = np.cumsum(problem.imu.recorded) - 1   # of a sample in ``samples``
+    span = ((log.stamp[inner + 1] - log.stamp[inner - 1]) * 1e-9)[:, None]
+    attitude = Rotation.from_quat(x[:, 6:10])
+    rate = (attitude[inner - 1].inv() * attitude[inner + 1]).as_rotvec() / span
+    rate += attitude[inner].inv().apply(problem.earth_rate)
+    fall = np.array([gravity_world(at, problem.gravity) for at in x[inner, 0:3]])
+    fall -= 2.0 * np.cross(problem.earth_rate, x[inner, 3:6])
+    force = attitude[inner].inv().apply((x[inner + 1, 3:6] - x[inner - 1, 3:6]) / span - fall)
+    turn = attitude[inner].as_matrix()
+    cov_velocity = samples["cov_velocity"][row[inner]]
+    ends = (samples["cov_attitude"][row[inner]].diagonal(0, 1, 2),
+            np.einsum("nji,njk,nki->ni", turn, cov_velocity, turn))
+    for name, value, end, unknown, lost in (
+            ("gyr", rate, ends[0], p.unknown_gyro_density, clipped[inner, 0:3]),
+            ("acc", force, ends[1], p.unknown_acc_density, clipped[inner, 3:6])):
+        sd = np.sqrt(np.minimum(2.0 * end / span ** 2, unknown ** 2 / span))
+        for field, new in ((name, value), (name + "_sd", sd)):
+            samples[field][row[inner]] = np.where(lost, new, samples[field][row[inner]])

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.smoother.inputs import evaluate_constraints, surface_points
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.smoother.inputs import evaluate_constraints, holds, surface_points
 
 _STRETCH = 1.0  # s, over which deviations are averaged: slower than what the Imu itself holds
 
@@ -18,6 +19,8 @@ class SurfaceFit:
     ``excess``: RMS of the means over stretches of a second (``surface_interval`` if longer), by
     the standard deviation that sigma gives such a mean. The smoother pulls the trajectory to
     the surface, so a surface that fits leaves less than 1.
+    ``silent``: share of the samples at which the constraint should hold, but the surface says
+    nothing (outside of an elevation grid).
     """
 
     sample: np.ndarray
@@ -26,33 +29,43 @@ class SurfaceFit:
     rms: float
     largest: float
     excess: float
+    silent: float = 0.0
 
 
 def at_surface(samples, states, params):
-    """Samples whose ``position_world``, ``vel_world`` and ``cov_position`` are those of the point
-    that is held on the surface: p + R l, v + R (w x l).
+    """Samples whose position and velocity, with covariances, are those of the point that is held
+    on the surface: p + R l, v + R (w x l).
 
-    The errors of position, attitude and lever arm count as uncorrelated. Across the surface
-    they are not, and the point is known better than that.
+    The errors of position, velocity, attitude, lever arm and rate count as uncorrelated. Across
+    the surface they are not, and the point is known better than that.
 
     Args:
         samples, states: of the SmootherResult.
         params: SmootherParams.
     """
-    lever, sd = states.get("surface_lever_arm", (np.array(params.surface_lever_arm), 0.0))
+    lever, lever_sd = states.get("surface_lever_arm", (np.array(params.surface_lever_arm), 0.0))
     if not np.any(lever):
         return samples
     lever = np.broadcast_to(lever, samples["position_world"].shape)
-    turn = Rotation.from_quat(samples["quat_world_imu"])
-    # Rows of R [l]x are those of R, crossed with l.
-    arm = np.cross(turn.as_matrix(), lever[:, None])
+    lever_cov = np.broadcast_to(lever_sd, lever.shape)[:, None] ** 2 * np.eye(3)
+    gyr_cov = samples["gyr_sd"][:, None] ** 2 * np.eye(3)
+    turn = Rotation.from_quat(samples["quat_world_imu"]).as_matrix()
+    swing = np.cross(samples["gyr"], lever)
+
+    def crossed(v):
+        """R [v]x: the rows of R, each crossed with v."""
+        return np.cross(turn, v[:, None])
+
     moved = samples.copy()
     moved["position_world"] = surface_points(samples["position_world"],
                                              samples["quat_world_imu"], lever)
-    moved["vel_world"] += turn.apply(np.cross(samples["gyr"], lever))
-    spread = turn.as_matrix() * np.broadcast_to(sd, lever.shape)[:, None]
-    moved["cov_position"] += (arm @ samples["cov_attitude"] @ arm.swapaxes(1, 2)
-                              + spread @ spread.swapaxes(1, 2))
+    moved["vel_world"] += np.einsum("nij,nj->ni", turn, swing)
+    for name, parts in (
+            ("cov_position", ((crossed(lever), samples["cov_attitude"]), (turn, lever_cov))),
+            ("cov_velocity", ((crossed(swing), samples["cov_attitude"]),
+                              (crossed(lever), gyr_cov), (crossed(samples["gyr"]), lever_cov)))):
+        for by, cov in parts:
+            moved[name] += by @ cov @ by.swapaxes(1, 2)
     return moved
 
 
@@ -62,6 +75,9 @@ def surface_fits(constraints, samples, states, events, params):
     Args:
         constraints: of the surface. samples, states, events: of the SmootherResult.
         params: SmootherParams.
+
+    Raises:
+        EstimationError: none holds anywhere, though there are some.
     """
     fits = {}
     position_world = at_surface(samples, states, params)["position_world"]
@@ -78,7 +94,12 @@ def surface_fits(constraints, samples, states, events, params):
         fits[constraint.name] = SurfaceFit(
             sample, residual, constraint.sigma, float(np.sqrt(np.mean(residual ** 2))),
             float(np.abs(residual).max()),
-            _excess(samples["stamp"][sample], residual, sigma, params.surface_interval))
+            _excess(samples["stamp"][sample], residual, sigma, params.surface_interval),
+            1.0 - len(residual) / holds(constraint, samples["stamp"], events, params).sum())
+    if constraints and not fits:
+        raise EstimationError("the surface says nothing at any sample of this recording: an "
+                              "elevation grid must reach the trajectory (see its crs and extent), "
+                              "surface_windows must lie within the recording")
     return fits
 
 

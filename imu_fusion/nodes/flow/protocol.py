@@ -16,6 +16,7 @@ BEGIN, NEXT, END = "begin", "next", "end"
 # Events on /flow/ack.
 ACK, DONE = "ack", "done"
 
+RENEWED = "renewed"  # at a topic of BEGIN: a new writer, whose numbers begin at one
 COMPANY = "nodes"  # key of BEGIN beside the topics: the sinks that the source knows
 
 

@@ -177,8 +177,10 @@ class FlowSink:
             self._abandon(old, "was replaced by a new one")
         start, topics = {}, {}
         for topic, value in values.items():
-            sent, topics[topic] = value.split()
+            sent, topics[topic], *renewed = value.split()
             start[topic] = int(sent)
+            if renewed and topic in self.inboxes and self.inboxes[topic].session is None:
+                self.inboxes[topic].last = None  # of the writer before
         session = Session(message.hardware_id, message.name, topics, start,
                           idle_since=time.monotonic(), company=company)
         self.sessions[session.source] = session

@@ -9,8 +9,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 from imu_fusion.nodes.flow.protocol import (
-    ACK_EVERY, ACK_QOS, ACK_TOPIC, BEGIN, COMPANY, DONE, END, STATUS_OFFERED, STATUS_TOPIC,
-    WINDOW, full_name, is_reliable, reliable_qos, status_message, steady_timer, type_name)
+    ACK_EVERY, ACK_QOS, ACK_TOPIC, BEGIN, COMPANY, DONE, END, RENEWED, STATUS_OFFERED,
+    STATUS_TOPIC, WINDOW, full_name, is_reliable, reliable_qos, status_message, steady_timer,
+    type_name)
 
 HEARSAY = 20.0  # s to discover a sink that another node knows; DDS forgets a dead one in 20 s
 _UNBOUNDED = float("inf")
@@ -20,7 +21,8 @@ _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # rmw: endpoint discovered before its nod
 class FlowPublisher:
     """A publisher that counts, and keeps what the window does not admit in an outbox."""
 
-    def __init__(self, source, publisher, msg_type, qos):
+    def __init__(self, source, publisher, name, msg_type, qos):
+        self.name = name  # before remapping
         self.msg_type = msg_type
         self.topic = publisher.topic_name
         self.sent = 0  # equals the DDS sequence number of the last message
@@ -46,6 +48,11 @@ class FlowPublisher:
         if self.sent >= self._look_at:
             self._look_at = self.sent + ACK_EVERY
             self._source.look_for_joiners()
+
+    def renew(self, qos):
+        """Begin anew, between sessions: what was latched is forgotten."""
+        self._publisher = self._source.exchange(self, self._publisher, qos)
+        self.qos, self.sent, self._look_at = qos, 0, 0
 
     def matched(self):
         """Number of subscriptions that get what is published now."""
@@ -95,6 +102,7 @@ class FlowSource:
         self._begin_after_drain = False
         self._company = set()
         self._start = {}
+        self._renewed = set()  # topics whose sequence numbers have begun anew
         self._ending = None  # the event that ends the session
         self._announced = False
         self.session = None
@@ -107,9 +115,15 @@ class FlowSource:
         """Make a :class:`FlowPublisher`; all of them before the session begins."""
         qos = qos or reliable_qos()
         publisher = FlowPublisher(
-            self, self._node.create_publisher(msg_type, topic, qos), msg_type, qos)
+            self, self._node.create_publisher(msg_type, topic, qos), topic, msg_type, qos)
         self._publishers[publisher.topic] = publisher
         return publisher
+
+    def exchange(self, publisher, old, qos):
+        """A new rclpy publisher in place of an old one; see :meth:`FlowPublisher.renew`."""
+        self._renewed.add(publisher.topic)
+        self._node.destroy_publisher(old)
+        return self._node.create_publisher(publisher.msg_type, publisher.name, qos)
 
     def begin(self, company=()):
         """Announce a session; :meth:`ready` turns true when all sinks have answered.
@@ -204,6 +218,7 @@ class FlowSource:
 
     def _announce(self):
         values = {topic: f"{sent} {type_name(self._publishers[topic].msg_type)}"
+                  + (f" {RENEWED}" if topic in self._renewed else "")
                   for topic, sent in self._start.items()}
         values[COMPANY] = " ".join(sorted(self._consumers))
         self._status.publish(status_message(self._name, self.session, BEGIN, values))
