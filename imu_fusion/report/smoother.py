@@ -30,6 +30,7 @@ _STATES = {
     "gyr_scale": ("gyroscope scale", "%", 100.0, _XYZ),
     "gnss_lever_arm": ("antenna in the imu frame", "m", 1.0, _XYZ),
     "body_height": ("height above the surface", "m", 1.0, ("height",)),
+    "surface_lever_arm": ("point on the surface in the imu frame", "m", 1.0, _XYZ),
 }
 _BOUND, _IDEAL = 1.96, 95.0  # of a standard normal distribution, and its share within, %
 

@@ -4,6 +4,7 @@ attached to samples and whitened, constraints evaluated."""
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
@@ -260,6 +261,37 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         loss=np.concatenate([np.full(len(p[0]), p[4] ** 2) for p in parts]))
 
 
+def surface_points(position_world, quat_world_imu, lever_imu):
+    """Points (N, 3) m that are held on the surface: p + R l.
+
+    Args:
+        position_world: (N, 3) m, of the sensor.
+        quat_world_imu: (N, 4).
+        lever_imu: l, (3,) or (N, 3) m. Zeros give ``position_world`` itself.
+    """
+    if not np.any(lever_imu):
+        return position_world
+    return position_world + Rotation.from_quat(quat_world_imu).apply(np.array(lever_imu))
+
+
+def lever_gradient(start, gradient, quat_world_imu, lever_imu):
+    """Derivatives of constraint rows at p + R l to the attitude and to the lever arm l.
+
+    With a = R' g for a gradient g: a . (dtheta x l) = dtheta . (l x a), and a . dl.
+
+    Args:
+        start: (N + 1,) where the rows of each sample begin. gradient: (r, 3).
+        quat_world_imu: (N, 4). lever_imu: (3,) or (N, 3) m.
+
+    Returns:
+        (r, 3) m/rad, of the rotation vector in imu axes, and (r, 3).
+    """
+    sample = np.repeat(np.arange(len(quat_world_imu)), np.diff(start))
+    along = Rotation.from_quat(quat_world_imu[sample]).inv().apply(gradient)
+    lever = np.broadcast_to(lever_imu, quat_world_imu[:, :3].shape)[sample]
+    return np.cross(lever, along), along
+
+
 def holds(constraint, stamp, events, params):
     """Mask (N,) of the samples at which a constraint holds: its phase of a jump, and the windows.
 
@@ -286,7 +318,7 @@ def evaluate_constraints(constraints, position_world, stamp, events, params):
 
     Args:
         constraints: of the surface.
-        position_world: (N, 3) m, in the frame of the surface.
+        position_world: (N, 3) m, in the frame of the surface, of the points held on it.
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
         params: SmootherParams; ``event_margin`` around the events heights are free.

@@ -1,8 +1,8 @@
 """The iterated smoother: Gauss-Newton on one explicit cost.
 
-    J = sum of squared normalised process noise + squared normalised initial error
-        + sum over fixes, velocities and magnetometer readings of loss(residual)
-        + sum over constraint rows of (residual / sigma)^2
+    J = 1/2 [ sum of squared normalised process noise + squared normalised initial error
+              + sum over fixes, velocities and magnetometer readings of loss(residual)
+              + sum over constraint rows of (residual / sigma)^2 ]
 
 An extended Kalman filter gives the first trajectory. Each step linearises the motion and
 all rows about the last trajectory and solves the linear problem exactly, by a filter
@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_fusion.estimation.smoother import kernel, model
-from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.inputs import (evaluate_constraints, lever_gradient,
+                                                   surface_points)
 from imu_fusion.estimation.smoother.transition import boxminus
 
 _BEGINNING = 20_000_000_000   # ns, from which first attitudes are judged at least
@@ -119,6 +120,24 @@ class Problem:
         other.attach()
         return other
 
+    def _surface_lever(self):
+        """Lever arm (3,) or (N, 3) m of the point that is held on the surface."""
+        i = self.layout[model.SURFACE_ARM]
+        return self.params.surface_lever_arm if i < 0 else self.x[:, i + 1:i + 4]
+
+    def surface_points(self):
+        """Points (N, 3) m of the trajectory that are held on the surface."""
+        return surface_points(self.x[:, 0:3], self.x[:, 6:10], self._surface_lever())
+
+    def _constraint_rows(self, events):
+        start, residual, gradient, *others = evaluate_constraints(
+            self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params)
+        state, lever = self.layout[model.SURFACE_ARM] >= 0, self._surface_lever()
+        if state or np.any(lever):
+            turned, along = lever_gradient(start, gradient, self.x[:, 6:10], lever)
+            gradient = np.hstack([gradient, turned, along] if state else [gradient, turned])
+        return start, residual, gradient, *others
+
     def step(self, events, with_cov=False):
         """One Gauss-Newton step; moves x.
 
@@ -128,8 +147,7 @@ class Problem:
         """
         n, total = self.size, len(self.x)
         if self.constraints:
-            self.rows = evaluate_constraints(self.constraints, self.x[:, 0:3],
-                                             self.imu.log.stamp, events, self.params)
+            self.rows = self._constraint_rows(events)
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
         boxminus(self.prior, self.x[0], delta)
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))

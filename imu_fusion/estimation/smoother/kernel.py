@@ -17,8 +17,9 @@ import numpy as np
 from numba import njit
 
 from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE, FIX,
-                                                  LEVER_ARM, POS, VEL, VELOCITY, interval,
-                                                  predict_fix, predict_mag, predict_velocity)
+                                                  LEVER_ARM, POS, SURFACE_ARM, VEL, VELOCITY,
+                                                  interval, predict_fix, predict_mag,
+                                                  predict_velocity)
 from imu_fusion.estimation.smoother.transition import (adjoint_rows, apply_step, boxminus,
                                                        boxplus, interval_noise, propagate_cov,
                                                        propagate_rows, slow_noise)
@@ -49,7 +50,9 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             (3,); lever arm (3,).
         measured: sorted by sample: start (N + 1,), kind, tau, value (M, 3), whitening matrix
             (M, 3, 3), squared scale of the robust loss (0: squared loss).
-        rows: constraints sorted by sample: start (N + 1,), residual, gradient, sigma, height.
+        rows: constraints sorted by sample: start (N + 1,), residual, gradient (r, 3), sigma,
+            height. Where not the sensor itself is held on the surface, the gradient goes on with
+            the derivatives to the attitude (r, 6) and the surface lever arm (r, 9).
         innovation: (M, 3) normalised innovations, result.
         storage: what the backward pass needs (:func:`make_storage`): entries, indices, count,
             gain, value and start of the rows; deviation and covariance after the rows; rows
@@ -96,8 +99,8 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             if kind == FIX:
                 predicted = predict_fix(x[k], tau, rate, force, rotation, lever, layout, h)
             elif kind == VELOCITY:
-                predicted = predict_velocity(x[k], tau, dt, rate, force, rotation, f_vel, lever,
-                                             layout, h)
+                predicted = predict_velocity(x[k], tau, dt, rate, force, rotation, f_vel, columns,
+                                             lever, layout, h)
             else:
                 predicted = predict_mag(x[k], tau, rate, rotation, field, layout, h)
             # Whitening keeps the rows of one measurement independent.
@@ -144,10 +147,15 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
         for c in range(c_start[k], c_start[k + 1]):
             count = 0
             gap = -c_residual[c]
-            for i in range(3):
+            for i in range(c_gradient.shape[1]):
                 if c_gradient[c, i] != 0.0:
                     entries[count] = c_gradient[c, i] / c_sigma[c]
-                    used[count] = POS + i
+                    if i < 3:
+                        used[count] = POS + i
+                    elif i < 6:
+                        used[count] = ATT + i - 3
+                    else:
+                        used[count] = layout[SURFACE_ARM] + i - 6
                     count += 1
             if c_height[c] and layout[BODY_HEIGHT] >= 0:
                 gap += x[k, layout[BODY_HEIGHT] + 1]

@@ -21,9 +21,10 @@ POS, VEL, ATT, GYR_BIAS, ACC_BIAS, CORE = 0, 3, 6, 9, 12, 15
 #: Optional blocks of the error state, in their order, with their sizes.
 BLOCKS = (("mag_bias", 3), ("mag_scale", 3), ("gnss_position_error", 3),
           ("gnss_time_offset", 1), ("velocity_time_offset", 1), ("acc_matrix", 9),
-          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1), ("gnss_velocity_error", 3))
+          ("gyr_scale", 3), ("gnss_lever_arm", 3), ("body_height", 1), ("surface_lever_arm", 3),
+          ("gnss_velocity_error", 3))
 (MAG_BIAS, MAG_SCALE, GNSS_ERROR, TIME_OFFSET, VELOCITY_OFFSET, ACC_MATRIX, GYR_SCALE,
- LEVER_ARM, BODY_HEIGHT, GNSS_VELOCITY_ERROR) = range(10)
+ LEVER_ARM, BODY_HEIGHT, SURFACE_ARM, GNSS_VELOCITY_ERROR) = range(len(BLOCKS))
 
 FIX, VELOCITY, MAG = 0, 1, 2
 
@@ -143,8 +144,24 @@ def interval(x, gyr, acc, dt, gravity, spin, decay, layout, f_vel, f_att, x_next
 
 
 @njit(cache=True)
+def _scale_columns(x, rate, layout, h):
+    """Columns of the gyroscope's scale in h (3, n), while those of its bias hold what the rate
+    alone does: the scale enters the rate with the other sign, times the reading."""
+    if layout[GYR_SCALE] >= 0:
+        for j in range(3):
+            # The reading that gave the rate, but for the Earth's (7e-5 rad/s).
+            gyr = (rate[j] + x[10 + j]) / (1.0 + x[layout[GYR_SCALE] + 1 + j])
+            for i in range(3):
+                h[i, layout[GYR_SCALE] + j] = -gyr * h[i, GYR_BIAS + j]
+
+
+@njit(cache=True)
 def predict_fix(x, tau, rate, force_world, rotation, lever, layout, h):
-    """Antenna position (3,) at ``tau`` after the sample, and its derivative h (3, n)."""
+    """Antenna position (3,) at ``tau`` after the sample, and its derivative h (3, n).
+
+    The acceleration's derivatives times tau^2 / 2 are left out (:func:`predict_mag` says what
+    that does): at 10 ms 5e-5 m per m/s^2 of bias, 0.005 sd with 300 fixes good to 1 cm.
+    """
     cross = np.empty(3)
     cross[0] = rate[1] * lever[2] - rate[2] * lever[1]
     cross[1] = rate[2] * lever[0] - rate[0] * lever[2]
@@ -158,6 +175,8 @@ def predict_fix(x, tau, rate, force_world, rotation, lever, layout, h):
         h[i, POS + i] = 1.0
         h[i, VEL + i] = tau
     _cross_matrix(rotation, arm, -1.0, h, 0, ATT)
+    _cross_matrix(rotation, lever, tau, h, 0, GYR_BIAS)
+    _scale_columns(x, rate, layout, h)
     if layout[GNSS_ERROR] >= 0:
         for i in range(3):
             predicted[i] += x[layout[GNSS_ERROR] + 1 + i]
@@ -168,12 +187,13 @@ def predict_fix(x, tau, rate, force_world, rotation, lever, layout, h):
                                           + rotation[i, 0] * cross[0] + rotation[i, 1] * cross[1]
                                           + rotation[i, 2] * cross[2])
     if layout[LEVER_ARM] >= 0:
-        h[:, layout[LEVER_ARM]:layout[LEVER_ARM] + 3] = rotation
+        _cross_matrix(rotation, rate, tau, h, 0, layout[LEVER_ARM])
+        h[:, layout[LEVER_ARM]:layout[LEVER_ARM] + 3] += rotation
     return predicted
 
 
 @njit(cache=True)
-def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, lever, layout, h):
+def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, columns, lever, layout, h):
     """Antenna velocity (3,) at ``tau`` after the sample, and its derivative h (3, n)."""
     cross = np.empty(3)
     cross[0] = rate[1] * lever[2] - rate[2] * lever[1]
@@ -182,12 +202,15 @@ def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, lever, layo
     predicted = np.empty(3)
     _cross_matrix(rotation, cross, -1.0, h, 0, ATT)
     _cross_matrix(rotation, lever, 1.0, h, 0, GYR_BIAS)
+    _scale_columns(x, rate, layout, h)
+    if tau != 0.0:
+        for i in range(3):
+            for c in columns:
+                h[i, c] += tau / dt * f_vel[i, c]
     for i in range(3):
         predicted[i] = (x[3 + i] + tau * force_world[i] + rotation[i, 0] * cross[0]
                         + rotation[i, 1] * cross[1] + rotation[i, 2] * cross[2])
         h[i, VEL + i] = 1.0
-        for j in range(3):
-            h[i, ATT + j] += tau / dt * f_vel[i, ATT + j]
     if layout[GNSS_VELOCITY_ERROR] >= 0:
         for i in range(3):
             predicted[i] += x[layout[GNSS_VELOCITY_ERROR] + 1 + i]
@@ -203,7 +226,13 @@ def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, lever, layo
 
 @njit(cache=True)
 def predict_mag(x, tau, rate, rotation, field_world, layout, h):
-    """Magnetometer reading (3,) at ``tau`` after the sample (Fang 2020, eq. 50), and h (3, n)."""
+    """Magnetometer reading (3,) at ``tau`` after the sample (Fang 2020, eq. 50), and h (3, n).
+
+    With the field F in sensor axes: (1 + s) (F - tau w x F) + b. What the errors of the
+    gyroscope turn F by within tau (0.5 uT per rad/s at 10 ms) is left out of h. Residuals are
+    exact, so N readings whose entries lack e shift a state by some sqrt(N) e sd / sigma of its
+    standard deviation sd: 0.005 for the bias in a jump (N 2700, sigma 5 uT, sd 1e-3 rad/s).
+    """
     field = np.empty(3)
     for i in range(3):
         field[i] = (rotation[0, i] * field_world[0] + rotation[1, i] * field_world[1]
@@ -217,8 +246,16 @@ def predict_mag(x, tau, rate, rotation, field_world, layout, h):
         a, b = (i + 1) % 3, (i + 2) % 3
         scale = 1.0 + x[layout[MAG_SCALE] + 1 + i]
         predicted[i] = scale * turned[i] + x[layout[MAG_BIAS] + 1 + i]
-        h[i, ATT + a] = -scale * turned[b]
-        h[i, ATT + b] = scale * turned[a]
+        h[i, ATT + a] = -scale * field[b]
+        h[i, ATT + b] = scale * field[a]
         h[i, layout[MAG_SCALE] + i] = turned[i]
         h[i, layout[MAG_BIAS] + i] = 1.0
+    if tau != 0.0:
+        along = tau * (rate[0] * field[0] + rate[1] * field[1] + rate[2] * field[2])
+        for i in range(3):
+            # An error d of the attitude turns F by F x d, and w x (F x d) = F (w d) - d (w F).
+            scale = 1.0 + x[layout[MAG_SCALE] + 1 + i]
+            for j in range(3):
+                h[i, ATT + j] -= scale * tau * field[i] * rate[j]
+            h[i, ATT + i] += scale * along
     return predicted

@@ -77,8 +77,13 @@ class SmootherParams(Parameters):
     mag_loss_scale: float = param(6.0, doc="Scale of the Cauchy loss on the magnetometer, in "
                                   "standard deviations; 0: squared loss", low=0.0)
 
-    body_height: float = param(0.0, doc="Height of the sensor above the surface", unit="m")
+    body_height: float = param(0.0, doc="Height of the sensor above the surface, or of "
+                               "the point at surface_lever_arm", unit="m")
     body_height_sd: float = param(0.0, doc="Its uncertainty, as a state", unit="m", low=0.0)
+    surface_lever_arm: tuple[float, ...] = param(
+        (0.0, 0.0, 0.0), doc="Point that is held on the surface (skis, wheels), in the imu frame",
+        unit="m", length=3)
+    surface_lever_arm_sd: float = param(0.0, doc="Its uncertainty, as states", unit="m", low=0.0)
     surface_interval: float = param(
         0.01, doc="Time after which a deviation from the surface counts as a new one: sigma is that "
         "of rows so far apart, and what they say per second does not depend on the rate of the "

@@ -11,7 +11,7 @@ from imu_fusion.estimation.smoother.inputs import (prepare_imu, prepare_measurem
                                                    reference_frame)
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult, reading_variances
-from imu_fusion.estimation.smoother.surface_fit import surface_fits
+from imu_fusion.estimation.smoother.surface_fit import at_surface, surface_fits
 from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
 from imu_fusion.surfaces.hill import Hill
@@ -92,6 +92,7 @@ class Smoother:
                   "velocity_time_offset": [p.velocity_time_offset_sd], "acc_matrix": [p.acc_matrix_sd] * 9,
                   "gyr_scale": [p.gyro_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
                   "body_height": [p.body_height_sd],
+                  "surface_lever_arm": [p.surface_lever_arm_sd] * 3,
                   "gnss_velocity_error": drift if drift.any() else 0}
         present = {name: sd for name, sd in blocks.items() if np.any(sd)}
         layout, size = model.make_layout(present)
@@ -138,9 +139,11 @@ class Smoother:
         # A fifth of a second: long enough against noise, short against motion.
         beginning = int(np.searchsorted(log.stamp, log.stamp[0] + 200_000_000))
         acc = log.acc[:beginning].mean(axis=0)
-        i = problem.layout[model.LEVER_ARM]
-        if i >= 0:
-            prior[i + 1:i + 4] = p.gnss_lever_arm
+        for block, lever in ((model.LEVER_ARM, p.gnss_lever_arm),
+                             (model.SURFACE_ARM, p.surface_lever_arm)):
+            i = problem.layout[block]
+            if i >= 0:
+                prior[i + 1:i + 4] = lever
         i = problem.layout[model.BODY_HEIGHT]
         problem.prior, problem.x = prior, np.empty((len(log), size + 1))
         if i >= 0:
@@ -196,7 +199,7 @@ class Smoother:
                        for kind, name in _KINDS.items() if np.any(kinds == kind)}
         jump = None
         if hill is not None:
-            jump = jump_result(hill, samples, log, events)
+            jump = jump_result(hill, at_surface(samples, states, problem.params), log, events)
         fits = surface_fits(problem.constraints, samples, states, events, problem.params)
         return SmootherResult(samples, frame, states, innovations, tuple(problem.cost), steps,
                               converged, events, jump, fits)
@@ -205,7 +208,7 @@ class Smoother:
 def _positions(problem):
     samples = np.empty(len(problem.x), SAMPLE)
     samples["stamp"] = problem.imu.log.stamp
-    samples["position_world"], samples["vel_world"] = problem.x[:, 0:3], problem.x[:, 3:6]
+    samples["position_world"] = problem.surface_points()
     return samples
 
 
