@@ -279,7 +279,9 @@ class ExtendedRts:
                        for kind, name in _NAMES.items()}
         jump = jump_result(hill, samples, prepared.log, events) if hill is not None else None
         constraints = () if hill is None else hill.constraints()
-        fits = surface_fits(constraints, samples, states, events, params)
+        # The paper holds the sensor itself on the hill.
+        at_sensor = params.replace(surface_lever_arm=(0.0, 0.0, 0.0))
+        fits = surface_fits(constraints, samples, states, events, at_sensor)
         return SmootherResult(samples, frame, states, innovations, (cost,), 1, None, events, jump,
                               fits)
 
