@@ -18,6 +18,7 @@ GAP_FACTOR = 1.8
 # At rest, consumer accelerometers are within a few percent of gravity.
 _GRAVITY = 9.81
 _GRAVITY_TOLERANCE = 0.15
+_AS_QUIET = 1.5   # times the least spread, which scatters by a tenth in half a second at 100 Hz
 # Median norms of a field measured on Earth, with room for magnets and lost calibrations.
 _FIELD_T = (5e-6, 500e-6)
 _EARTH_T = (20e-6, 70e-6)
@@ -197,7 +198,7 @@ def check_saturation(values, name, quantity, unit, limit=None):
 def check_acceleration(acc, stamp, name):
     """A finding if specific force (n, 3) is not in m/s^2, or has gravity removed.
 
-    Judged at its quietest half second, where only gravity acts.
+    Judged at its quietest half seconds, where mostly gravity acts.
     """
     norm = _quiet_norm(acc, stamp)
     if not np.isfinite(norm):
@@ -340,7 +341,11 @@ def _runs(mask):
 
 
 def _quiet_norm(values, stamp):
-    """Mean norm of (n, 3) in the half second in which the norm varies least; NaN if too short."""
+    """Norm of (n, 3) in the half seconds in which it varies least; NaN if too short.
+
+    Noise alone decides which of them is the quietest, and steady braking is as quiet as rest:
+    the median of all that are nearly so.
+    """
     norm = np.linalg.norm(np.asarray(values, dtype=np.float64), axis=1)
     finite = np.isfinite(norm)
     norm = norm[finite]
@@ -351,4 +356,5 @@ def _quiet_norm(values, stamp):
     if len(norm) < window:
         return np.nan
     blocks = norm[:len(norm) // window * window].reshape(-1, window)
-    return float(blocks[np.argmin(blocks.std(axis=1))].mean())
+    spread = blocks.std(axis=1)
+    return float(np.median(blocks[spread <= _AS_QUIET * spread.min()].mean(axis=1)))

@@ -181,3 +181,16 @@ def test_fixes_without_a_fix_are_told():
     findings = checks.check_fix(log)
     assert kinds(findings) == ["fix", "nan"]
     assert len(findings) == 4
+
+
+def test_steady_braking_that_happens_to_be_quietest_is_no_finding():
+    rng = np.random.default_rng(2)
+    acc = np.tile([0.0, 0.0, 9.81], (2000, 1)) + rng.normal(0.0, 0.1, (2000, 3))
+    acc[1000:1100, 0] += 7.0                            # one second of 0.7 g, and
+    middle = acc[1000:1050].mean(axis=0)
+    acc[1000:1050] = middle + 0.6 * (acc[1000:1050] - middle)
+    norm = np.linalg.norm(acc, axis=1).reshape(-1, 50)
+    assert norm.std(axis=1).argmin() == 20              # the quietest half second of all
+    stamp = np.arange(2000) * 10_000_000
+    assert checks.check_acceleration(acc, stamp, "imu") == []
+    assert checks.check_acceleration(acc / 9.81, stamp, "imu")[0].kind == "unit"
