@@ -87,8 +87,8 @@ class _Child:
         return True
 
     def close(self):
-        if self._process.is_alive() and self.outcome is None:
-            self._process.kill()
+        """End the process: it has nothing more to say, or nobody listens any more."""
+        self._process.kill()
         self._process.join()
         self._pipe.close()
 

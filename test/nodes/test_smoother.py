@@ -104,14 +104,17 @@ def test_who_comes_late_gets_all_of_the_last_result_and_nothing_else(graph, tmp_
     graph.until(lambda: len(stamps["late"]) >= 1500)
     assert stamps["late"] == [START + i * STEP for i in range(1500)]
     # A sink that has heard the old publisher counts the new one from its beginning.
-    heard, ended = [], []
-    sink = FlowSink(graph.node("sink"), on_end=lambda session: ended.append(session.event))
+    heard, begun, ended = [], [], []
+    sink = FlowSink(graph.node("sink"), on_begin=lambda session: begun.append(inbox.last),
+                    on_end=lambda session: ended.append(session.event))
     inbox = sink.subscribe(Odometry, "/smoother/odometry", lambda cdr, _: heard.append(cdr),
                            reliable_qos(5000, DurabilityPolicy.TRANSIENT_LOCAL))
     graph.until(lambda: len(heard) == 1500)
+    assert inbox.last == 1500
     assert graph.call(node, Trigger, "/smoother/smooth", timeout=120.0).success
     graph.until(lambda: ended)
     assert len(heard) == 3000 and ended == [END] and not inbox.lost
+    assert begun[-1] == 0  # else what it acknowledges opens the window too far
 
 
 def test_a_bad_surface_ends_the_node_at_its_start(graph):
