@@ -37,10 +37,12 @@ def find_jump(imu, velocity, takeoff=None, touchdown=None):
         if at is not None and at > length:
             raise EstimationError(f"{name} is given as {at:g} s, but the Imu samples end at "
                                   f"{length:.1f} s")
-    found = detect_jump(imu, velocity) if None in (takeoff, touchdown) else None
-    stamps = [detected if at is None else int(imu.stamp[0]) + round(at * 1e9)
-              for at, detected in ((takeoff, found and found.takeoff),
-                                   (touchdown, found and found.touchdown))]
+    stamps = [None if at is None else int(imu.stamp[0]) + round(at * 1e9)
+              for at in (takeoff, touchdown)]
+    if None in stamps:
+        found = detect_jump(imu, velocity)
+        stamps = [detected if given is None else given
+                  for given, detected in zip(stamps, (found.takeoff, found.touchdown))]
     if stamps[1] <= stamps[0]:
         raise EstimationError("the touch-down that was detected is before the take-off that was "
                               "given, or the reverse: give both (takeoff, touchdown)")
@@ -180,7 +182,7 @@ class JumpResult:
     landing_speed_sd: float
 
     def to_mapping(self):
-        """Names and values, for JSON and CSV."""
+        """Names and values, for JSON."""
         return asdict(self)
 
 

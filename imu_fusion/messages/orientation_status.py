@@ -6,18 +6,13 @@ bias as a geometry_msgs/TwistWithCovarianceStamped.
 """
 
 import numpy as np
-from rosbags.typesys.stores.ros2_jazzy import (
-    builtin_interfaces__msg__Time as Time,
-    diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
-    diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
-    diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
 
-from imu_fusion.errors import MessageError
 from imu_fusion.estimation import orientation_state as st
-from imu_fusion.messages.bag import TYPES
-from imu_fusion.messages.layouts import NANOSECONDS, TWIST
+from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
+                                             diagnostics_value)
+from imu_fusion.messages.layouts import TWIST
 
-FLAGS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
+FLAGS_TYPE = DIAGNOSTICS_TYPE
 _NAME = "orientation"
 
 # Flags that last, by the word that stands for them; those that worry last.
@@ -43,12 +38,10 @@ def lasting_flags(flags, before):
 def flags_message(stamp, frame_id, flags):
     """CDR bytes of a diagnostic_msgs/DiagnosticArray. stamp: int ns; flags: of WORDS."""
     words = [word for flag, word in WORDS.items() if flags & flag]
-    status = DiagnosticStatus(
-        level=int(bool(flags & _WORRIES)), name=_NAME, message=", ".join(words) or "in motion",
-        hardware_id=frame_id,
-        values=[KeyValue(key=word, value=str(bool(flags & flag))) for flag, word in WORDS.items()])
-    header = Header(stamp=Time(*divmod(stamp, NANOSECONDS)), frame_id=frame_id)
-    return bytes(TYPES.serialize_cdr(DiagnosticArray(header=header, status=[status]), FLAGS_TYPE))
+    return diagnostics_message(
+        stamp, frame_id, _NAME, ", ".join(words) or "in motion",
+        {word: str(bool(flags & flag)) for flag, word in WORDS.items()},
+        bool(flags & _WORRIES), frame_id)
 
 
 def flags_value(cdr):
@@ -57,14 +50,8 @@ def flags_value(cdr):
     Raises:
         MessageError: the bytes are no DiagnosticArray.
     """
-    try:
-        message = TYPES.deserialize_cdr(cdr, FLAGS_TYPE)
-    except Exception as error:  # the library raises whatever the bytes lead it to
-        raise MessageError(f"{FLAGS_TYPE}: {len(cdr)} bytes that cannot be read ({error})") from None
-    true = {v.key for s in message.status if s.name == _NAME for v in s.values if v.value == "True"}
-    stamp = message.header.stamp
-    return (stamp.sec * NANOSECONDS + stamp.nanosec,
-            sum(flag for flag, word in WORDS.items() if word in true))
+    stamp, values = diagnostics_value(cdr, _NAME)
+    return stamp, sum(flag for flag, word in WORDS.items() if values.get(word) == "True")
 
 
 def bias_message(row, frame_id):

@@ -9,17 +9,14 @@ from array import array
 from dataclasses import dataclass
 
 import numpy as np
-from rosbags.typesys.stores.ros2_jazzy import (
-    builtin_interfaces__msg__Time as Time,
-    diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
-    diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
-    diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, MessageError, SampleError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.messages.bag import TYPES
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
+from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
+                                             diagnostics_value)
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
 from imu_fusion.messages.streams import EstimatorNodeParams
 from imu_fusion.parameters import param
@@ -36,12 +33,12 @@ REQUIRED = (IMU_TOPIC, FIX_TOPIC)
 ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
 SMOOTHED_FIX_TOPIC, PATH_TOPIC = "smoother/fix", "smoother/path"
 RESULTS_TOPIC = "smoother/results"
-PATH_TYPE, RESULTS_TYPE = "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticArray"
+PATH_TYPE = "nav_msgs/msg/Path"
 OUTPUTS = {ODOMETRY_TOPIC: ODOMETRY.msgtype, SMOOTHED_IMU_TOPIC: IMU.msgtype,
-           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE, RESULTS_TOPIC: RESULTS_TYPE}
+           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE, RESULTS_TOPIC: DIAGNOSTICS_TYPE}
 PER_SAMPLE = (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, SMOOTHED_FIX_TOPIC)
 
-
+_NAME = "smoother"
 _SLICE = 1000  # samples whose messages are made at once
 
 
@@ -186,11 +183,10 @@ def smooth(params, logs):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a result says in words and plain numbers: ``summary`` one line, ``remarks`` texts,
-    ``numbers`` for JSON, ``frame`` LocalFrame and ``frame_id`` of the sensor."""
+    """What a result says in words and plain numbers: ``summary`` one line, ``numbers`` for JSON,
+    ``remarks`` (texts) among them; ``frame`` LocalFrame and ``frame_id`` of the sensor."""
 
     summary: str
-    remarks: list
     numbers: dict
     frame: object
     frame_id: str
@@ -203,31 +199,33 @@ class Outcome:
                    "misfit": result.misfit()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
-        return cls(result.summary(), result.remarks(), numbers, result.frame, frame_id)
+        numbers["remarks"] = result.remarks()
+        return cls(result.summary(), numbers, result.frame, frame_id)
+
+    @property
+    def remarks(self):
+        """Texts on what makes the result doubtful."""
+        return self.numbers["remarks"]
 
     def message(self, stamp):
         """CDR bytes of the diagnostic_msgs/DiagnosticArray on smoother/results; values are JSON."""
-        values = [KeyValue(key=key, value=json.dumps(value))
-                  for key, value in {**self.numbers, "remarks": self.remarks}.items()]
-        status = DiagnosticStatus(level=int(bool(self.remarks)), name="smoother",
-                                  message=self.summary, hardware_id=self.frame_id, values=values)
-        header = Header(stamp=Time(*divmod(int(stamp), NANOSECONDS)), frame_id="world")
-        return bytes(TYPES.serialize_cdr(DiagnosticArray(header=header, status=[status]),
-                                         RESULTS_TYPE))
+        return diagnostics_message(
+            stamp, "world", _NAME, self.summary,
+            {key: json.dumps(value) for key, value in self.numbers.items()},
+            bool(self.remarks), self.frame_id)
 
 
 def results_value(cdr):
-    """The plain numbers (dict) in a message of smoother/results, with ``remarks``.
+    """The numbers (dict) of an Outcome in a message of smoother/results.
 
     Raises:
         MessageError: the bytes are no such message.
     """
+    values = diagnostics_value(cdr, _NAME)[1]
     try:
-        (status,) = TYPES.deserialize_cdr(cdr, RESULTS_TYPE).status
-        return {entry.key: json.loads(entry.value) for entry in status.values}
-    except Exception as error:  # the library raises whatever the bytes lead it to
-        raise MessageError(f"{RESULTS_TOPIC}: {len(cdr)} bytes that cannot be read ({error})"
-                           ) from None
+        return {key: json.loads(value) for key, value in values.items()}
+    except ValueError as error:
+        raise MessageError(f"{RESULTS_TOPIC}: a value cannot be read as JSON ({error})") from None
 
 
 def messages(samples, outcome, path_rate):
@@ -324,7 +322,6 @@ def run(logs, report, params):
         report.skipped = str(error)
         return
     outcome = Outcome.of(result, logs[IMU_TOPIC][0].frame_id)
-    report.summary = outcome.summary
-    report.results = {**outcome.numbers, "remarks": outcome.remarks}
+    report.summary, report.results = outcome.summary, outcome.numbers
     report.remarks = outcome.remarks
     yield from messages(result.samples, outcome, params.path_rate)

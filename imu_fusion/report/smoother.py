@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.consistency import nees
+from imu_fusion.estimation.smoother.inputs import valid_fixes
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Section, Table, Text
@@ -54,8 +55,7 @@ class Smoothed:
 
     def fixes_world(self):
         """Valid fixes: FixLog and positions (m, 3) m."""
-        fix = self.fix[(self.fix.status >= 0) & np.isfinite(self.fix.latitude_deg)
-                       & np.isfinite(self.fix.height)]
+        fix = self.fix[valid_fixes(self.fix)]
         return fix, self.result.frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
 
     def delay(self, *states):

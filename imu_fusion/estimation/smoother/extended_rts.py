@@ -1,14 +1,8 @@
 """The method of Fang et al. (2020), as published: the baseline of the benchmarks.
 
 Extended Rauch-Tung-Striebel smoother with an additive quaternion and its norm as a pseudo
-measurement: states (40), parameters (42), inputs (41), outputs (48)-(50), constraints
-(51), settings of tables 3 to 5. Where the print errs: the covariance prediction (13) is
-``Phi P Phi' + Gamma Q Gamma'``, and the last term of (45) is ``- w x v``. The noise of
+measurement, equations in :mod:`.extended_rts_model`, settings of tables 3 to 5. The noise of
 table 4 is that of one sample, held over the sample.
-
-Frames are those of the paper: position in the hill frame N (x forward, z down), velocity in
-body axes, quaternion (w, x, y, z) of the body against north-east-down (O); magnetic
-quantities in microtesla.
 
 Memory: a filtered covariance, a predicted one and a transition matrix of every sample are
 11.6 kB. So the filter keeps its state at the first of every ``_SEGMENT`` samples only, and
@@ -16,13 +10,14 @@ the pass back filters each segment once more; the operations are the same and so
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.events import find_jump, jump_result
+from imu_fusion.estimation.smoother.extended_rts_model import (
+    DA, DW, ENU_NED, Model, Q, R, SIZE, V, d_to_ned, rate_matrix, to_ned)
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors
 from imu_fusion.estimation.smoother.inputs import (holds, prepare_imu, prepare_measurements,
                                                    reference_frame)
@@ -32,16 +27,9 @@ from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import hill_axes
 from imu_fusion.geometry.gravity import normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
-from imu_fusion.geometry.rotation import skew
 from imu_fusion.surfaces.hill import Hill
 
-_R, _V, _Q = slice(0, 3), slice(3, 6), slice(6, 10)
-_DW, _DA, _DM, _DS = slice(10, 13), slice(13, 16), slice(16, 19), slice(19, 22)
-_N = 22
-_SERIES = 10    # terms of (7)-(9): the next is w^10 / 10!, 1e-11 where w = |rate| dt is 0.35
 _SEGMENT = 64   # samples kept at once on the way back
-_EYE = np.eye(3)
-_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 # Tables 3 and 5.
 _P0 = np.square([5, 5, 15, 1, 1, 3, *[0.1] * 4, *[0.0873] * 3, *[0.2] * 3, *[5.0] * 3,
@@ -50,151 +38,6 @@ _R_READING = {FIX: np.square([3, 3, 5.0]), VELOCITY: np.square([0.1, 0.1, 0.3]),
               MAG: np.full(3, 25.0)}
 _R_NORM = 0.01 ** 2
 _NAMES = {FIX: "fix", VELOCITY: "velocity", MAG: "mag"}
-
-
-def _to_ned(q):
-    """M_BO transposed (47), without normalisation, as the derivatives need it."""
-    w, v = q[0], q[1:]
-    return (w * w - v @ v) * _EYE + 2.0 * v[:, None] * v + 2.0 * w * skew(v)
-
-
-def _d_to_ned(q, u):
-    """Derivative (3, 4) of M_BO' u by q."""
-    w, v = q[0], q[1:]
-    out = np.empty((3, 4))
-    out[:, 0] = w * u + skew(v) @ u
-    out[:, 1:] = (v @ u) * _EYE + v[:, None] * u - u[:, None] * v - w * skew(u)
-    return 2.0 * out
-
-
-def _d_to_body(q, u):
-    """Derivative (3, 4) of M_BO u by q."""
-    conjugate = q * [1.0, -1.0, -1.0, -1.0]
-    return _d_to_ned(conjugate, u) * [1.0, -1.0, -1.0, -1.0]
-
-
-def _rate_matrix(q):
-    """The matrix of (46), (4, 3)."""
-    w, x, y, z = q
-    return np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
-
-
-def discretise(a, f, dt):
-    """Phi (7) and Gamma (9) of an interval by their series; with B for F, (8).
-
-    Args:
-        a: (n, n) derivative of the state equations by the state. f: (n, k) by the noise. dt: s.
-
-    Returns:
-        (n, n), (n, k).
-    """
-    term = np.eye(len(a))
-    phi, gamma = term.copy(), dt * term
-    for i in range(1, _SERIES):
-        term = term @ a * (dt / i)
-        phi += term
-        gamma += term * (dt / (i + 1))
-    return phi, gamma @ f
-
-
-@dataclass(frozen=True)
-class Model:
-    """State, output and constraint equations (44)-(51) and their derivatives.
-
-    ``axes`` (3, 3): R_hill_world. ``gravity_ned`` (3,) m/s^2, ``field_ned`` (3,) microtesla.
-    ``hill``: Hill or None. A state x (22,) is position, velocity, quaternion (40) and the
-    biases of gyroscope, accelerometer, magnetometer and its scale errors (42).
-    """
-
-    axes: np.ndarray
-    gravity_ned: np.ndarray
-    field_ned: np.ndarray
-    hill: object = None
-
-    @cached_property
-    def to_hill(self):
-        """M_NO (31), (3, 3)."""
-        return self.axes @ _ENU_NED
-
-    def rate(self, x, u):
-        """The state equations (44)-(46) for inputs u (6,); parameters stand still (22)."""
-        omega, force = u[:3] - x[_DW], u[3:] - x[_DA]
-        to_ned = _to_ned(x[_Q])
-        rate = np.zeros(_N)
-        rate[_R] = self.to_hill @ (to_ned @ x[_V])
-        rate[_V] = force + to_ned.T @ self.gravity_ned - skew(omega) @ x[_V]
-        rate[_Q] = 0.5 * _rate_matrix(x[_Q]) @ omega
-        return rate
-
-    def jacobians(self, x, u):
-        """Derivatives of :meth:`rate`: A (22, 22) by the state, F (22, 6) by the noise (43)."""
-        omega = u[:3] - x[_DW]
-        a, f = np.zeros((_N, _N)), np.zeros((_N, 6))
-        a[_R, _V] = self.to_hill @ _to_ned(x[_Q])
-        a[_R, _Q] = self.to_hill @ _d_to_ned(x[_Q], x[_V])
-        a[_V, _V] = -skew(omega)
-        a[_V, _Q] = _d_to_body(x[_Q], self.gravity_ned)
-        a[_V, _DW] = -skew(x[_V])
-        a[_V, _DA] = -_EYE
-        a[6, 7:10], a[7:10, 6], a[7:10, 7:10] = -omega, omega, -skew(omega)
-        a[_Q, _Q] *= 0.5
-        a[_Q, _DW] = -0.5 * _rate_matrix(x[_Q])
-        f[:, :3], f[:, 3:] = a[:, _DW], a[:, _DA]
-        return a, f
-
-    def predict(self, x, cov, u0, u1, dt, q):
-        """Equations (12), (13): Runge-Kutta with inputs that go linearly from u0 to u1.
-
-        Args:
-            x, cov: filtered state (22,) and covariance (22, 22). u0, u1: (6,) rad/s, m/s^2.
-            dt: s. q: (6,) variances of one sample of the inputs.
-
-        Returns:
-            State, covariance, Phi.
-        """
-        phi, gamma = discretise(*self.jacobians(x, u0), dt)
-        middle = 0.5 * (u0 + u1)
-        k1 = self.rate(x, u0)
-        k2 = self.rate(x + 0.5 * dt * k1, middle)
-        k3 = self.rate(x + 0.5 * dt * k2, middle)
-        k4 = self.rate(x + dt * k3, u1)
-        return (x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4),
-                phi @ cov @ phi.T + (gamma * q) @ gamma.T, phi)
-
-    def output(self, kind, x):
-        """Reading of a kind (FIX, VELOCITY, MAG) as predicted (3,) by (48)-(50) and its
-        derivative (3, 22): m in the hill frame, m/s north-east-down, microtesla in body axes."""
-        h = np.zeros((3, _N))
-        if kind == FIX:
-            h[:, _R] = _EYE
-            return x[_R], h
-        to_ned = _to_ned(x[_Q])
-        if kind == VELOCITY:
-            h[:, _V], h[:, _Q] = to_ned, _d_to_ned(x[_Q], x[_V])
-            return to_ned @ x[_V], h
-        scale, body = 1.0 + x[_DS], to_ned.T @ self.field_ned
-        h[:, _Q] = scale[:, None] * _d_to_body(x[_Q], self.field_ned)
-        h[:, _DM], h[:, _DS] = _EYE, np.diag(body)
-        return scale * body + x[_DM], h
-
-    def constraints(self, x, names):
-        """The norm and those of the hill's constraints that are named, (51): name -> (value,
-        derivative (22,)), m, of the quaternion without unit."""
-        norm = np.linalg.norm(x[_Q])
-        h = np.zeros(_N)
-        h[_Q] = x[_Q] / norm
-        rows = {"norm": (norm - 1.0, h)}
-        for name in names:
-            h = np.zeros(_N)
-            if name == "in_run_lateral":
-                h[1] = 1.0
-                rows[name] = (x[1], h)
-                continue
-            profile = self.hill.in_run if name == "in_run" else self.hill.landing
-            z, slope, _ = profile(x[0])
-            h[0], h[2] = -slope, 1.0
-            rows[name] = (x[2] - z, h)
-        return rows
 
 
 @dataclass(frozen=True)
@@ -253,7 +96,7 @@ class ExtendedRts:
             field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg, frame.height,
                                          decimal_year(fix.stamp[0]))
         model = Model(hill.axes if hill is not None else hill_axes(0.0),
-                      np.array([0.0, 0.0, gravity]), _ENU_NED @ np.asarray(field) * 1e6, hill)
+                      np.array([0.0, 0.0, gravity]), ENU_NED @ np.asarray(field) * 1e6, hill)
         data = _bind(model, prepared, measurements, events, params)
         try:
             samples, mag_errors, mag_sd, innovation, cost = _smooth(
@@ -309,7 +152,7 @@ def _bind(model, prepared, measurements, events, params):
     if not (np.any(kind == VELOCITY) and np.any(kind == MAG)):
         raise EstimationError("method extended_rts needs a magnetometer and GNSS velocities")
     value[kind == FIX] = value[kind == FIX] @ model.axes.T
-    value[kind == VELOCITY] = value[kind == VELOCITY] @ _ENU_NED.T
+    value[kind == VELOCITY] = value[kind == VELOCITY] @ ENU_NED.T
     constraints = model.hill.constraints() if model.hill is not None else ()
     strict = params.replace(event_margin=0.0)
     active = {c.name: holds(c, log.stamp, events, strict) for c in constraints}
@@ -325,11 +168,11 @@ def _first_state(model, data, quat_world_imu):
     fix, velocity, mag = (data.value[data.kind == kind][0] for kind in (FIX, VELOCITY, MAG))
     if quat_world_imu is None:
         quat_world_imu = attitude_from_vectors(data.inputs[0, 3:], mag,
-                                               _ENU_NED @ model.field_ned)
-    attitude = _ENU_NED @ Rotation.from_quat(quat_world_imu).as_matrix()
-    x = np.zeros(_N)
-    x[_R], x[_V] = fix, attitude.T @ velocity
-    x[_Q] = np.roll(Rotation.from_matrix(attitude).as_quat(), 1)
+                                               ENU_NED @ model.field_ned)
+    attitude = ENU_NED @ Rotation.from_quat(quat_world_imu).as_matrix()
+    x = np.zeros(SIZE)
+    x[R], x[V] = fix, attitude.T @ velocity
+    x[Q] = np.roll(Rotation.from_matrix(attitude).as_quat(), 1)
     return x
 
 
@@ -409,7 +252,7 @@ def _smooth(model, data, x):
     samples, mag, mag_sd = np.empty(n, SAMPLE), np.empty((n, 6)), np.empty((n, 6))
     for first, last, x0, cov0 in reversed(kept):
         trace, _ = _filter(model, data, first, last, x0, cov0, innovation)
-        states, covs = np.empty((last - first, _N)), np.empty((last - first, _N, _N))
+        states, covs = np.empty((last - first, SIZE)), np.empty((last - first, SIZE, SIZE))
         for i in range(last - first - 1, -1, -1):
             filtered, cov_filtered, ahead = trace[i]
             if ahead is None:  # (17), (18)
@@ -434,18 +277,18 @@ def _samples(model, stamp, inputs, x, cov, sd):
     this package: structured array (:data:`SAMPLE`)."""
     samples = np.empty(len(x), SAMPLE)
     samples["stamp"] = stamp
-    samples["position_world"] = x[:, _R] @ model.axes
-    samples["cov_position"] = model.axes.T @ cov[:, _R, _R] @ model.axes
-    attitude = Rotation.from_matrix(_ENU_NED) * Rotation.from_quat(np.roll(x[:, _Q], -1, axis=1))
-    samples["vel_world"] = attitude.apply(x[:, _V])
+    samples["position_world"] = x[:, R] @ model.axes
+    samples["cov_position"] = model.axes.T @ cov[:, R, R] @ model.axes
+    attitude = Rotation.from_matrix(ENU_NED) * Rotation.from_quat(np.roll(x[:, Q], -1, axis=1))
+    samples["vel_world"] = attitude.apply(x[:, V])
     samples["quat_world_imu"] = attitude.as_quat()
     for sample, xk, ck in zip(samples, x, cov):
-        q = xk[_Q] / np.linalg.norm(xk[_Q])
-        h = _ENU_NED @ np.hstack([_to_ned(q), _d_to_ned(q, xk[_V])])
+        q = xk[Q] / np.linalg.norm(xk[Q])
+        h = ENU_NED @ np.hstack([to_ned(q), d_to_ned(q, xk[V])])
         sample["cov_velocity"] = h @ ck[3:10, 3:10] @ h.T
-        local = 2.0 * _rate_matrix(q).T  # dq = 1/2 Omega(q) dtheta, inverted
-        sample["cov_attitude"] = local @ ck[_Q, _Q] @ local.T
-    samples["gyr_bias"], samples["acc_bias"] = x[:, _DW], x[:, _DA]
-    samples["gyr_bias_sd"], samples["acc_bias_sd"] = sd[:, _DW], sd[:, _DA]
-    samples["gyr"], samples["acc"] = inputs[:, :3] - x[:, _DW], inputs[:, 3:] - x[:, _DA]
+        local = 2.0 * rate_matrix(q).T  # dq = 1/2 Omega(q) dtheta, inverted
+        sample["cov_attitude"] = local @ ck[Q, Q] @ local.T
+    samples["gyr_bias"], samples["acc_bias"] = x[:, DW], x[:, DA]
+    samples["gyr_bias_sd"], samples["acc_bias_sd"] = sd[:, DW], sd[:, DA]
+    samples["gyr"], samples["acc"] = inputs[:, :3] - x[:, DW], inputs[:, 3:] - x[:, DA]
     return samples

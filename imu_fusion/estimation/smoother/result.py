@@ -24,10 +24,11 @@ _BESIDE = 5.0                # standard deviations of the median innovation of f
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
 _CAUSES = {
     "fix": "the covariances of the messages (gnss_covariances: false) or fix_sd may be too small, "
-           "the stamps late (gnss_time_offset_sd: 0.2 finds it) or the errors wander (gnss_position_error_sd)",
+           "the stamps late (gnss_time_offset_sd: 0.2 finds it) or the errors wander "
+           "(gnss_position_error_sd)",
     "velocity": "the covariances of the messages (gnss_covariances: false) or velocity_sd may be "
-                "too small, the stamps late (velocity_time_offset_sd: 0.2 finds it) or filtered (gnss_velocity_error_sd, "
-                "gnss_min_interval)",
+                "too small, the stamps late (velocity_time_offset_sd: 0.2 finds it) or filtered "
+                "(gnss_velocity_error_sd, gnss_min_interval)",
     "mag": "the field may be disturbed, or mag_sd, mag_bias_sd and mag_scale_sd too small"}
 
 
