@@ -21,7 +21,7 @@ test = ["pytest>=7.4", "pytest-xdist>=3.5", "hypothesis>=6", "colcon-common-exte
         *terrain]
 
 nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
-         "acceleration_field_estimator", "pipeline"]
+         "acceleration_field_estimator", "smoothing_trigger"]
 
 setup(
     name=package_name,

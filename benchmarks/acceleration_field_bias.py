@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.acceleration_field_cases import (METHODS, PARAMS, errors, fitted_densities, noisy,
                                                  paper_sensors)
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
                                                      simulate)
 

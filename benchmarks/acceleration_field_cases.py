@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field import (AccelerationFieldEstimator,
+from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
                                                       AccelerationFieldParams)
-from imu_fusion.estimation.acceleration_field_layout import AccelerometerParams
-from imu_fusion.estimation.acceleration_field_rows import field_at
+from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.rows import field_at
 from imu_fusion.simulation.noise import ornstein_uhlenbeck
 from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS)
 

@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 
 from benchmarks.data import data_path
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field import (AccelerationFieldEstimator,
+from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
                                                       AccelerationFieldParams, GyroscopeParams)
-from imu_fusion.estimation.acceleration_field_calibration import calibrate_array
-from imu_fusion.estimation.acceleration_field_layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
+from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
 
 RATE = 62.5
 LIMIT = np.radians(1000)

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field import (AccelerationFieldEstimator,
+from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
                                                       AccelerationFieldParams)
-from imu_fusion.estimation.acceleration_field_layout import AccelerometerParams
-from imu_fusion.estimation.acceleration_field_start import given_start
+from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.start import given_start
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS
 from imu_fusion.simulation.rigid_body_motion import draw_motion, ideal_readings
 

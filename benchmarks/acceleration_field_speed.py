@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.acceleration_field_cases import METHODS, PARAMS, noisy, paper_sensors
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field_layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 SAMPLES = 5001

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.acceleration_field_cases import (METHODS, PARAMS, errors, fitted_densities, noisy,
                                                  paper_sensors, plus_minus)
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
                                                      simulate)
 

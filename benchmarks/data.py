@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.orientation_error import split_angles
-from imu_fusion.messages.smoothing import SmoothingParams
-from imu_fusion.parameter_file import parameters_for
+from imu_fusion.evaluation.orientation_error import split_angles
+from imu_fusion.streams.smoother import SmoothingParams
+from imu_fusion.parameters.file import parameters_for
 from imu_fusion.samples.logs import ImuLog, MagLog
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.consistency import nees
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record

@@ -23,7 +23,7 @@ from vqf import VQF, offlineVQF
 
 from benchmarks.data import broad_errors, broad_trials, load_broad
 from benchmarks.table import RESULTS, write_table
-from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.samples.logs import ImuLog, MagLog
 
 GYR_DELAY, MAG_DELAY = 0.004, 0.015

@@ -11,7 +11,7 @@ from vqf import offlineVQF
 from benchmarks.data import broad_errors, broad_trials, load_broad
 from benchmarks.orientation_broad import GYR_DELAY, compensated, fusion
 from benchmarks.table import write_table
-from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.table import write_table
-from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.samples.logs import MagLog
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate

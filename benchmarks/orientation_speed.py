@@ -18,13 +18,13 @@ import numpy as np
 from vqf import VQF, offlineVQF
 
 from benchmarks.table import write_table
-from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 
 _START = """
 import time
 start = time.process_time()
-from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.simulation.rotation import Tumbling, simulate
 imu, mag, _, _ = simulate(Tumbling(seed=1), 2.0)
 OrientationEstimator(OrientationParams(method="{}")).run(imu, mag)

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks import smoother_drive, smoother_flight
 from benchmarks.orientation_broad import offline_vqf, vqf
 from benchmarks.table import write_table
-from imu_fusion.estimation.orientation import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.smoother import Smoother
-from imu_fusion.parameter_file import load
+from imu_fusion.parameters.file import load
 
 _VEHICLE = Path(__file__).parent.parent / "config/orientation_vehicle.yaml"
 

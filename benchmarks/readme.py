@@ -9,7 +9,7 @@ from pathlib import Path
 
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.base import Node
-from imu_fusion.parameters import markdown_table
+from imu_fusion.parameters.declare import markdown_table
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).parent / "results"

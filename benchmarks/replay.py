@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_fusion.graph import Graph
-from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.nodes.processes import Graph
+from imu_fusion.recordings.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import imu_message, mag_message, read_log
 
 DURATION = 600  # s

@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.jumps import HEADER, join, monte_carlo, write
 from imu_fusion.estimation.smoother import SmootherParams
 from imu_fusion.simulation.ski_jump import FASTEST_WOBBLE, JumpParams, SkiJump
-from imu_fusion.surface_file import load_surface
+from imu_fusion.surfaces.file import load_surface
 
 SEEDS = 300
 PAPER_SEEDS = 30

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.jumps import HEADER, monte_carlo, moved, write
-from imu_fusion.estimation.events import JumpEvents
+from imu_fusion.estimation.smoother.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
-from imu_fusion.surface_file import load_surface, surface_from_mapping
+from imu_fusion.surfaces.file import load_surface, surface_from_mapping
 
 SEEDS = range(20)
 TOTAL_SD = np.array([3.0, 3.0, 5.0])

@@ -7,12 +7,12 @@ import numpy as np
 import yaml
 
 from benchmarks.jumps import moved, score, write
-from imu_fusion.demos_trajectory import shared
+from imu_fusion.demos.trajectory import shared
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.simulation.jump_sensors import record
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
-from imu_fusion.surface_file import load_surface, surface_from_mapping
+from imu_fusion.surfaces.file import load_surface, surface_from_mapping
 
 SEEDS = range(20)
 NAME = "oberstdorf_hs106"

@@ -11,18 +11,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from imu_fusion.compiling import announced_compiling
+from imu_fusion.kernels import announced_compiling
 from imu_fusion.errors import TopicError
-from imu_fusion.estimation.orientation import OrientationParams
-from imu_fusion.messages import acceleration_field_stream as field_stream
-from imu_fusion.messages import orientation_stream as orientation
-from imu_fusion.messages import smoothing
-from imu_fusion.messages.bag import BagWriter, find_topic, open_bag
+from imu_fusion.estimation.orientation.estimator import OrientationParams
+from imu_fusion.streams import acceleration_field as field_stream
+from imu_fusion.streams import orientation
+from imu_fusion.streams import smoother as smoothing
+from imu_fusion.recordings.bag import BagWriter, find_topic, open_bag
 from imu_fusion.messages.convert import SAMPLE_TYPES
-from imu_fusion.messages.streams import EstimatorNodeParams
-from imu_fusion.parameter_file import node_values, parameters_for
+from imu_fusion.streams.stream import EstimatorNodeParams
+from imu_fusion.parameters.file import node_values, parameters_for
 from imu_fusion.samples.guard import guard_log
-from imu_fusion.surface_file import load_surface
+from imu_fusion.surfaces.file import load_surface
 
 
 @dataclass(frozen=True)

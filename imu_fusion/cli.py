@@ -119,7 +119,7 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
     Each node is a process of an own ROS domain. OUT holds what was played and the estimates,
     the same as those of `process`.
     """
-    from imu_fusion import pipeline as nodes
+    from imu_fusion.nodes import pipeline as nodes
     nodes.run(bag, out, params_file, without, _remaps(remap), overwrite)
     click.echo(f"written: {out}")
     if with_report:
@@ -136,8 +136,8 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
               help="Copy all that can be read into a clean recording OUT.")
 def info(bag, target):
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
-    from imu_fusion.messages.bag import open_bag, repair
-    from imu_fusion.messages.inspect import inspect_topics
+    from imu_fusion.recordings.bag import open_bag, repair
+    from imu_fusion.recordings.inspect import inspect_topics
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
@@ -180,11 +180,11 @@ def convert(source, out, topics, description, remap, overwrite):
     if description is not None:
         if topics or remap:
             raise click.UsageError("--csv goes without --topic and --remap")
-        from imu_fusion.messages.csv_import import import_csv
+        from imu_fusion.recordings.csv_import import import_csv
         parameter_file, count = import_csv(source, description, out, overwrite)
         click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
         return
-    from imu_fusion.messages.importers import import_files, importer_of
+    from imu_fusion.recordings.importers import import_files, importer_of
     importer = importer_of(source)
     if importer is not None:
         if topics or remap:
@@ -193,7 +193,7 @@ def convert(source, out, topics, description, remap, overwrite):
         click.echo(f"written: {out} with "
                    + ", ".join(f"{n} of {topic}" for topic, n in sorted(counts.items())))
         return
-    from imu_fusion.messages.bag import BagWriter, open_bag
+    from imu_fusion.recordings.bag import BagWriter, open_bag
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
@@ -266,7 +266,7 @@ def report(bag, estimates, params_file, out):
     The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
     recording of --estimates) holds imu/data. A reference in BAG shows the errors.
     """
-    from imu_fusion.compiling import announced_compiling
+    from imu_fusion.kernels import announced_compiling
     from imu_fusion.report.recording import write_recording_report
     with announced_compiling(lambda text: click.echo(text, err=True)):
         write_recording_report(bag, estimates, out, params_file)
@@ -283,7 +283,7 @@ def demo(name, out):
     NAME: orientation (a sensor turned by hand), drive (a car, GNSS withheld for a while) or
     jump (a simulated ski jump).
     """
-    from imu_fusion import demos
+    from imu_fusion.demos import demo as demos
     demos.run(name, out, console)
 
 

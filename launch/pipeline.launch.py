@@ -48,11 +48,11 @@ def start(context):
 
     recorder = node("recorder", out=given["out"], end_with_sources=True,
                     expected_sources=["smoother"])
-    pipeline = node("pipeline")
+    trigger = node("smoothing_trigger")
     replayer = node("replayer", bag=given["bag"], rate=float(given["rate"]),
-                    wait_for_subscribers=0, wait_for_nodes=["recorder", "pipeline", *estimators])
-    nodes = [recorder, pipeline, replayer, *(node(name, qos="reliable") for name in estimators)]
-    ends = [shutdown_if_failed(replayer), shutdown_if_failed(pipeline)]
+                    wait_for_subscribers=0, wait_for_nodes=["recorder", "smoothing_trigger", *estimators])
+    nodes = [recorder, trigger, replayer, *(node(name, qos="reliable") for name in estimators)]
+    ends = [shutdown_if_failed(replayer), shutdown_if_failed(trigger)]
     # The recorder ends by itself when replay and smoother have said that nothing more comes.
     if given["report"].lower() == "true":
         report = ExecuteProcess(output="screen", cmd=[

@@ -14,8 +14,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.orientation_error import moving_at
-from imu_fusion.messages.bag import open_bag
+from imu_fusion.evaluation.orientation_error import moving_at
+from imu_fusion.recordings.bag import open_bag
 from imu_fusion.messages.convert import read_log, string_value
 
 ROOT = Path(__file__).resolve().parent.parent

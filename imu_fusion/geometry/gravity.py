@@ -1,7 +1,7 @@
 """Normal gravity of WGS84, closed form; gravity and Earth rotation in a local frame."""
 
 import numpy as np
-from numba import njit
+from imu_fusion.kernels import njit
 
 # WGS84 (NIMA TR8350.2, 3rd edition, tables 3.1, 3.3 and 3.4).
 _A = 6378137.0
@@ -40,7 +40,7 @@ def earth_rate_world(latitude_deg):
     return _EARTH_RATE * np.array([0.0, np.cos(latitude), np.sin(latitude)])
 
 
-@njit(cache=True)
+@njit
 def gravity_world(position_world, gravity):
     """Gravity vector (3,) m/s^2, east-north-up, at a position near the origin.
 

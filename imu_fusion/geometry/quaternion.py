@@ -6,14 +6,14 @@ tuples of floats. :mod:`imu_fusion.geometry.rotation` has the same as arrays.
 
 import math
 
-from numba import njit
+from imu_fusion.kernels import njit
 
 # Below this angle the truncated series are exact to float64 rounding:
 # the first neglected term is of the order angle^6 / 5040 of the value.
 _SMALL = 1e-3
 
 
-@njit(cache=True)
+@njit
 def multiply(p, q):
     """Hamilton product p * q."""
     return (p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1],
@@ -22,20 +22,20 @@ def multiply(p, q):
             p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2])
 
 
-@njit(cache=True)
+@njit
 def conjugate(q):
     """Inverse of a unit quaternion."""
     return -q[0], -q[1], -q[2], q[3]
 
 
-@njit(cache=True)
+@njit
 def normalize(q):
     """q, not zero, scaled to unit length."""
     size = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return q[0] / size, q[1] / size, q[2] / size, q[3] / size
 
 
-@njit(cache=True)
+@njit
 def rotate(q, v):
     """v turned by the unit quaternion q."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -47,7 +47,7 @@ def rotate(q, v):
             v[2] + w * tz + x * ty - y * tx)
 
 
-@njit(cache=True)
+@njit
 def exp(phi, scale):
     """Unit quaternion of the rotation vector ``scale * phi``, rad."""
     a, b, c = scale * phi[0], scale * phi[1], scale * phi[2]
@@ -60,7 +60,7 @@ def exp(phi, scale):
     return s * a, s * b, s * c, math.cos(0.5 * angle)
 
 
-@njit(cache=True)
+@njit
 def log(q):
     """Rotation vector of a unit quaternion, of angle at most pi, rad."""
     n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]

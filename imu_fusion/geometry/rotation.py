@@ -8,12 +8,12 @@ call costs too much, :mod:`imu_fusion.geometry.quaternion` has the same with tup
 import math
 
 import numpy as np
-from numba import njit
+from imu_fusion.kernels import njit
 
 from imu_fusion.geometry import quaternion
 
 
-@njit(cache=True)
+@njit
 def _array(values):
     """A tuple of floats as an array."""
     out = np.empty(len(values))
@@ -22,7 +22,7 @@ def _array(values):
     return out
 
 
-@njit(cache=True)
+@njit
 def skew(v):
     """Matrix [v]x with ``skew(v) @ u == cross(v, u)``. v: (3,). Returns (3, 3)."""
     m = np.zeros((3, 3))
@@ -35,25 +35,25 @@ def skew(v):
     return m
 
 
-@njit(cache=True)
+@njit
 def quat_multiply(p, q):
     """Hamilton product p * q. p, q: (4,). Returns (4,)."""
     return _array(quaternion.multiply(p, q))
 
 
-@njit(cache=True)
+@njit
 def quat_conjugate(q):
     """Inverse of a unit quaternion. q: (4,). Returns (4,)."""
     return _array(quaternion.conjugate(q))
 
 
-@njit(cache=True)
+@njit
 def quat_normalize(q):
     """q scaled to unit length. q: (4,), not zero. Returns (4,)."""
     return _array(quaternion.normalize(q))
 
 
-@njit(cache=True)
+@njit
 def quat_to_matrix(q):
     """Rotation matrix of a unit quaternion. q: (4,). Returns (3, 3)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -70,7 +70,7 @@ def quat_to_matrix(q):
     return m
 
 
-@njit(cache=True)
+@njit
 def quat_from_matrix(m):
     """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978).
 
@@ -102,7 +102,7 @@ def quat_from_matrix(m):
     return quat_normalize(q)
 
 
-@njit(cache=True)
+@njit
 def quat_to_rpy(q):
     """Roll, pitch, yaw of a unit quaternion: R = Rz(yaw) Ry(pitch) Rx(roll) (REP 103).
 
@@ -116,43 +116,43 @@ def quat_to_rpy(q):
     return rpy
 
 
-@njit(cache=True)
+@njit
 def quat_rotate(q, v):
     """v turned by the unit quaternion q. q: (4,), v: (3,). Returns (3,)."""
     return _array(quaternion.rotate(q, v))
 
 
-@njit(cache=True)
+@njit
 def quat_rotate_inverse(q, v):
     """v turned by the inverse of the unit quaternion q. Returns (3,)."""
     return quat_rotate(quat_conjugate(q), v)
 
 
-@njit(cache=True)
+@njit
 def quat_exp(phi):
     """Unit quaternion of a rotation vector. phi: (3,) rad. Returns (4,)."""
     return _array(quaternion.exp(phi, 1.0))
 
 
-@njit(cache=True)
+@njit
 def quat_log(q):
     """Rotation vector of a unit quaternion, of angle at most pi. Returns (3,) rad."""
     return _array(quaternion.log(q))
 
 
-@njit(cache=True)
+@njit
 def so3_exp(phi):
     """Rotation matrix of a rotation vector. phi: (3,) rad. Returns (3, 3)."""
     return quat_to_matrix(quat_exp(phi))
 
 
-@njit(cache=True)
+@njit
 def so3_log(m):
     """Rotation vector of a rotation matrix. m: (3, 3). Returns (3,) rad."""
     return quat_log(quat_from_matrix(m))
 
 
-@njit(cache=True)
+@njit
 def right_jacobian(phi):
     """J with ``Exp(phi + d) = Exp(phi) Exp(J d)`` to first order. Returns (3, 3)."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -179,7 +179,7 @@ def right_jacobian(phi):
     return j
 
 
-@njit(cache=True)
+@njit
 def right_jacobian_inverse(phi):
     """Inverse of :func:`right_jacobian`, for angles below 2 pi. Returns (3, 3)."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]

@@ -1,1 +1,1 @@
-"""Messages and bags: samples and estimates to and from ROS types."""
+"""Samples and estimates to and from the bytes of ROS messages."""

@@ -238,7 +238,7 @@ def read_log(reader, topic, log_of=None):
     """The log of one topic of an open recording.
 
     Args:
-        reader: what :func:`imu_fusion.messages.bag.open_bag` returned.
+        reader: what :func:`imu_fusion.recordings.bag.open_bag` returned.
         topic: name, with or without leading slash.
         log_of: function of a list of messages, if not the one of its type
             (such as :func:`attitude_log`).

@@ -2,7 +2,7 @@
 
 from std_srvs.srv import Trigger
 
-from imu_fusion.messages.acceleration_field_stream import (NODE, NODE_PARAMETERS, OUTPUTS,
+from imu_fusion.streams.acceleration_field import (NODE, NODE_PARAMETERS, OUTPUTS,
                                                            SENSOR_PREFIXES,
                                                            AccelerationFieldStream,
                                                            FieldConfiguration)

@@ -15,7 +15,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from imu_fusion import parameter_file
+from imu_fusion.parameters import file as parameter_file
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
 from imu_fusion.nodes.flow import steady_timer
 

@@ -4,15 +4,15 @@ from contextlib import ExitStack
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from imu_fusion.compiling import announced_compiling
-from imu_fusion.messages.streams import EstimatorNodeParams
+from imu_fusion.kernels import announced_compiling
+from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
 
 
 class EstimatorNode(Node):
-    """A node around a :class:`imu_fusion.messages.streams.Stream`; also the relay's stage."""
+    """A node around a :class:`imu_fusion.streams.stream.Stream`; also the relay's stage."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)

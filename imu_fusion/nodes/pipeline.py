@@ -1,88 +1,84 @@
-"""The pipeline node: waits until a replay has ended, then has it smoothed."""
+"""A recording through real ROS 2 nodes, smoothed and recorded: one call.
 
-import sys
-import time
-from dataclasses import dataclass
+    replayer -> smoother and other estimators -> recorder; smoothing_trigger calls smoother/smooth
 
-from std_srvs.srv import Trigger
+Each node is a process of an own ROS domain. The estimates are those of ``batch.process``.
+"""
 
-from imu_fusion.errors import EstimationError, TopicError
-from imu_fusion.messages.smoothing import INPUTS, REQUIRED
-from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
-from imu_fusion.nodes.flow import BEGIN, NEXT, FlowSink
-from imu_fusion.nodes.flow.protocol import STATUS_TOPIC, full_name
-from imu_fusion.parameters import Parameters, param
+from pathlib import Path
 
+from imu_fusion.batch import inputs_of, stages, write_results
+from imu_fusion.errors import TopicError
+from imu_fusion.nodes.processes import Graph
+from imu_fusion.recordings.bag import open_bag
+from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
 
-@dataclass(frozen=True)
-class PipelineParams(Parameters):
-    """Parameters of the pipeline node."""
-
-    service: str = param("smoother/smooth", doc="service to call at the end of the replay")
-    wait_timeout: float = param(30.0, doc="give up when the service is absent for so long",
-                                unit="s", low=0)
+SMOOTHER = "smoother"
+_PATIENCE = 3600.0  # s; the nodes notice by themselves when nothing can come any more
 
 
-class Pipeline(Node):
-    """Wait for the end of a replay of imu/data_raw and fix, call smoother/smooth, tell the answer.
+def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, logs=None,
+        show=True):
+    """Replay a recording through the estimators into a new recording.
 
-    Ends with code 0 if the recording was smoothed and with 1 if not.
+    Args:
+        bag: recording with what the smoother needs.
+        out: rosbag2 directory to write: the recording, with old estimates left out, and the
+            new ones; results.json beside them as of ``batch.process``.
+        params_file: ROS 2 parameter file for all nodes, or None for defaults.
+        without: node names of estimators to leave out.
+        remap: dict of topic names of ours to those in the recording.
+        overwrite: replace ``out``.
+        logs: directory for what the nodes print; a temporary one if None.
+        show: let replayer and smoothing trigger print here.
+
+    Returns:
+        ROS domain id that was used.
+
+    Raises:
+        ImuFusionError: recording, parameters or topics are not usable, or a node failed.
     """
-
-    NAME = "pipeline"
-    PARAMETERS = (PipelineParams,)
-
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        self._source = None  # name of the node whose replay has ended
-        self._sent = None
-        self._client = self.create_client(Trigger, self.params(PipelineParams).service)
-        self._seen_at = time.monotonic()
-        self._sink = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end)
-        self._names = {self.resolve_topic_name(topic): topic for topic in INPUTS}
-        for topic, kind in INPUTS.items():
-            self._sink.subscribe(message_class(kind.layout.msgtype), topic, lambda cdr, info: None)
-
-    def work(self):
-        """See :meth:`Node.work`."""
-        if self._source is None:
-            return IDLE
-        if self._client.service_is_ready():
-            self._seen_at = time.monotonic()
-        elif time.monotonic() - self._seen_at > self.params(PipelineParams).wait_timeout:
-            raise TopicError(f"service {self._client.srv_name} is not there: does the smoother run?")
-        elif self._sent is not None:
-            raise EstimationError(f"service {self._client.srv_name} has vanished without an answer")
-        if self._sent is None:
-            # The source stays until every sink has everything: the smoother may lag behind us.
-            if self._client.service_is_ready() and self._source not in self._sources():
-                self._sent = self._client.call_async(Trigger.Request())
-        elif self._sent.done():
-            answer = self._sent.result()
-            if not answer.success:
-                raise EstimationError(f"not smoothed: {answer.message}")
-            print(f"pipeline: {answer.message}", file=sys.stderr)
-            self.finished = True
-        return IDLE
-
-    def _sources(self):
-        return {full_name(info) for info in self.get_publishers_info_by_topic(STATUS_TOPIC)}
-
-    def _on_begin(self, session):
-        played = {self._names.get(topic) for topic in session.topics}
-        missing = [topic for topic in REQUIRED if topic not in played]
-        if played & set(INPUTS) and missing:
-            raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there will be "
-                             "nothing to smooth")
-
-    def _on_end(self, session):
-        if session.event == BEGIN:
-            raise EstimationError(f"not smoothed: the replay of {session.source} broke off")
-        if session.event != NEXT:
-            self._source = session.source
-            self._seen_at = time.monotonic()
-
-
-def main(args=None):
-    """Entry point of the executable."""
-    return run_node(Pipeline, args)
+    known = stages()
+    for name in without:
+        if name not in known or name == SMOOTHER:
+            raise TopicError(f"no estimator '{name}' to leave out; there are: "
+                             + ", ".join(set(known) - {SMOOTHER}))
+    renamed, estimators, made = {}, [], set()
+    with open_bag(bag) as reader:
+        for stage in known.values():
+            # Here, for a bad file to be refused before anything starts.
+            stage, _ = stage.prepare(params_file)
+            if stage.node in without or stage.unusable:
+                continue
+            names, missing = inputs_of(stage, reader, remap or {})
+            if missing and stage.node != SMOOTHER:
+                continue
+            if missing:
+                raise TopicError(f"nothing to smooth: {missing}")
+            estimators.append(stage.node)
+            made |= stage.outputs.keys()
+            renamed |= {name: topic for topic, name in names.items()
+                        if name.lstrip("/") != topic}
+        old = tuple(name for name in reader.topics if name.lstrip("/") in made)
+    common = {"params_file": params_file and Path(params_file).absolute()}
+    with Graph(logs) as graph:
+        graph.start("recorder", **common, out=str(Path(out).absolute()), overwrite=overwrite,
+                    end_with_sources=True, expected_sources=(SMOOTHER,))
+        for node in estimators:
+            graph.start(node, **common, qos="reliable")
+        graph.start("smoothing_trigger", show=show, **common)
+        graph.start("replayer", show=show, **common, bag=str(Path(bag).absolute()), rate=0.0,
+                    exclude=old,
+                    remap=tuple(f"{name}:=/{topic}" for name, topic in renamed.items()),
+                    wait_for_subscribers=0, wait_for_nodes=("recorder", "smoothing_trigger", *estimators))
+        graph.wait("replayer", _PATIENCE)
+        graph.wait("smoothing_trigger", _PATIENCE)
+        # Rarely the recorder does not notice the end of the smoother's session (why is not
+        # understood): then its file has stopped growing.
+        graph.finish("recorder", 15.0, lambda: sum(
+            file.stat().st_size for file in Path(out).glob("*.mcap")))
+        domain = graph.domain
+    with open_bag(out) as reader:
+        found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
+    write_results(out, {SMOOTHER: found[-1]} if found else {})
+    return domain

@@ -12,15 +12,15 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.compiling import announced_compiling
+from imu_fusion.kernels import announced_compiling
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother.result import SAMPLE
-from imu_fusion.messages import smoothing
-from imu_fusion.messages.smoothing import (INPUTS, OUTPUTS, PER_SAMPLE, Collection,
+from imu_fusion.streams import smoother as smoothing
+from imu_fusion.streams.smoother import (INPUTS, OUTPUTS, PER_SAMPLE, Collection,
                                            SmootherNodeParams, SmoothingParams)
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import FlowSink, FlowSource, reliable_qos, sensor_qos
-from imu_fusion.surface_file import load_surface
+from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
 _PIECE = 10_000  # samples that the child sends at once

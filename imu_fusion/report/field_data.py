@@ -8,12 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.batch import field_configuration
-from imu_fusion.estimation.acceleration_field_rows import (ROW, SATURATED, field_at,
+from imu_fusion.estimation.acceleration_field.rows import (ROW, SATURATED, field_at,
                                                            rigid_gradient)
-from imu_fusion.estimation.impact_metrics import measure_impacts
-from imu_fusion.messages.acceleration_field_stream import (ACCEL_TOPIC, GYROSCOPE_TOPIC, IMU_TOPIC,
+from imu_fusion.estimation.acceleration_field.impact_metrics import measure_impacts
+from imu_fusion.streams.acceleration_field import (ACCEL_TOPIC, GYROSCOPE_TOPIC, IMU_TOPIC,
                                                            NODE, FieldConfiguration)
-from imu_fusion.messages.bag import find_topic, open_bag
+from imu_fusion.recordings.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, read_log
 from imu_fusion.messages.layouts import ACCEL, IMU
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation import orientation_error
+from imu_fusion.evaluation import orientation_error
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, time_figure
 from imu_fusion.report.html import Figure, Number, Numbers, Section, Table, Text

@@ -15,7 +15,7 @@ def overview_section(topics, origin):
     """Section about a whole recording.
 
     Args:
-        topics: list of TopicReport (imu_fusion.messages.inspect).
+        topics: list of TopicReport (imu_fusion.recordings.inspect).
         origin: int ns, zero of the time axis.
     """
     rows, ranges = [], []

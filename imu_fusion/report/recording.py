@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.batch import StageReport, stages
 from imu_fusion.errors import EstimationError, SampleError, TopicError
-from imu_fusion.estimation.orientation_error import moving_at, orientation_errors
-from imu_fusion.messages import smoothing
-from imu_fusion.messages.bag import find_topic, open_bag
+from imu_fusion.evaluation.orientation_error import moving_at, orientation_errors
+from imu_fusion.streams import smoother as smoothing
+from imu_fusion.recordings.bag import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value, read_log
-from imu_fusion.messages.inspect import inspect_topics
+from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
-from imu_fusion.messages.orientation_stream import BIAS_TOPIC, FLAGS_TOPIC
+from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
 from imu_fusion.report.acceleration_field import field_sections
 from imu_fusion.report.field_data import read_field
 from imu_fusion.report.figures import Shade, intervals
@@ -30,7 +30,7 @@ from imu_fusion.report.overview import overview_section
 from imu_fusion.report.smoother import Smoothed, smoother_numbers, smoother_sections
 from imu_fusion.samples import seconds
 from imu_fusion.samples.guard import guard_log
-from imu_fusion.surface_file import load_surface
+from imu_fusion.surfaces.file import load_surface
 
 RAW, MAGNETOMETER, ESTIMATES = "imu/data_raw", "imu/mag", "imu/data"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.consistency import nees
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother.inputs import valid_fixes
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.simulation.noise_gnss import GnssErrors, gnss_errors
 

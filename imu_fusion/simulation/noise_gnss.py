@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.parameters.declare import Parameters, param
 
 
 @dataclass(frozen=True)

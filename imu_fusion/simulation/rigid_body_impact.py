@@ -12,7 +12,7 @@ The paper does not print the mass, the step, or the height of the half-space. Th
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+from imu_fusion.kernels import njit
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
@@ -104,7 +104,7 @@ class RigidMotion:
         return np.stack([field(p) @ a.T for p, a in zip(positions, axes)], axis=1)
 
 
-@njit(cache=True)
+@njit
 def _to_world(quat, v):
     out = np.empty_like(v)
     for i in range(len(v)):
@@ -112,7 +112,7 @@ def _to_world(quat, v):
     return out
 
 
-@njit(cache=True)
+@njit
 def _to_body(quat, v):
     out = np.empty((len(quat), 3))
     for i in range(len(quat)):
@@ -153,7 +153,7 @@ def _shape_table():
     return _TABLE["table"]
 
 
-@njit(cache=True)
+@njit
 def _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step, coefficients):
     """Force (world) and torque about the centre (body) per unit mass, eq. (B.8)-(B.10)."""
     up = quat_rotate_inverse(q, np.array([0.0, 0.0, 1.0]))
@@ -179,7 +179,7 @@ def _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step, co
     return force, torque
 
 
-@njit(cache=True)
+@njit
 def _integrate(n, every, h, r, v, q, w, inertia, r_ref, axes2, ground, gravity, stiffness,
                knot0, knot_step, coefficients, out):
     """Explicit Lie-Stoermer-Verlet, eq. (B.2)-(B.7); one row of ``out`` every ``every`` steps."""

@@ -5,14 +5,14 @@ estimator says, no more and no less.
 """
 
 import numpy as np
-from numba import njit
+from imu_fusion.kernels import njit
 from scipy.linalg import cholesky
 
-from imu_fusion.estimation.acceleration_field_kernel import mean_rotation, motion_step
+from imu_fusion.estimation.acceleration_field.kernel import mean_rotation, motion_step
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 
 
-@njit(cache=True)
+@njit
 def _walk(x, quat, h, step, factor, acc_factor, every, white, xs, quats):
     for n in range(len(white) + 1):
         if n % every == 0:
@@ -35,7 +35,7 @@ def _walk(x, quat, h, step, factor, acc_factor, every, white, xs, quats):
 
 
 def draw_motion(params, start, samples, rng, substeps=20):
-    """Draw a motion from the prior of :mod:`imu_fusion.estimation.acceleration_field_kernel`.
+    """Draw a motion from the prior of :mod:`imu_fusion.estimation.acceleration_field.kernel`.
 
     Args:
         params: AccelerationFieldParams; the motion densities and the sample rate count.

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.surfaces.hill import Hill
 
 

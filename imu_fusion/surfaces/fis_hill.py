@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import LayoutError
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.surfaces.profile import (Arc, Line, Polynomial, Profile, TiltedCubic,
                                          TiltedParabola)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import MessageError
-from imu_fusion.estimation import orientation_state as st
-from imu_fusion.estimation.orientation import ORIENTATION_DTYPE
-from imu_fusion.messages import orientation_stream
+from imu_fusion.estimation.orientation import state as st
+from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
+from imu_fusion.streams import orientation as orientation_stream
 from imu_fusion.messages.orientation_status import (
     WORDS, bias_message, bias_values, flags_message, flags_value, lasting_flags)
 

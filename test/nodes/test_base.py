@@ -9,7 +9,7 @@ from rclpy.parameter import Parameter
 
 from imu_fusion.errors import ParameterError, TopicError
 from imu_fusion.nodes.base import Node, message_class, run_node
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.parameters.declare import Parameters, param
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,10 @@
 import rclpy
 import yaml
 
-from imu_fusion.messages.csv_import import import_csv
+from imu_fusion.recordings.csv_import import import_csv
 from imu_fusion.nodes import acceleration_field_estimator
 from imu_fusion.nodes.acceleration_field_estimator import AccelerationFieldEstimatorNode
-from test.messages.test_csv_import import describe, write
+from test.recordings.test_csv_import import describe, write
 
 
 def test_a_node_takes_the_parameter_file_of_a_table(tmp_path):

@@ -15,11 +15,11 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import ParameterError
-from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, MAG, VECTOR3
 from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value
-from imu_fusion.messages.orientation_stream import OUTPUTS as TYPES
+from imu_fusion.streams.orientation import OUTPUTS as TYPES
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode, transform
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate

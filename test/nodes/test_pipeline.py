@@ -4,13 +4,14 @@ import json
 
 import pytest
 
-from imu_fusion import batch, pipeline
+from imu_fusion import batch
+from imu_fusion.nodes import pipeline
 from imu_fusion.errors import EstimationError, LayoutError, TopicError
-from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
-from imu_fusion.messages.smoothing import RESULTS_TOPIC, results_value
-from imu_fusion.nodes.pipeline import Pipeline
+from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
+from imu_fusion.nodes.smoothing_trigger import SmoothingTrigger
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
@@ -43,9 +44,9 @@ def assert_same(processed, recorded, topics):
 def start(graph, bag, out, expected=("smoother",)):
     recorder = graph.start(Recorder, out=str(out), expected_sources=list(expected))
     graph.start(SmootherNode, qos="reliable")
-    node = graph.start(Pipeline)
+    node = graph.start(SmoothingTrigger)
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0,
-                           wait_for_nodes=["recorder", "smoother", "pipeline"])
+                           wait_for_nodes=["recorder", "smoother", "smoothing_trigger"])
     return recorder, node, replayer
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from sensor_msgs.msg import Imu
 
-from imu_fusion.compiling import NOTICE
-from imu_fusion.graph import Graph
-from imu_fusion.messages.bag import open_bag
+from imu_fusion.kernels import NOTICE
+from imu_fusion.nodes.processes import Graph
+from imu_fusion.recordings.bag import open_bag
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
 from test.nodes.conftest import START, STEP, collector

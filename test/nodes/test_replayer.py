@@ -7,7 +7,7 @@ from sensor_msgs.msg import Imu, MagneticField
 from std_srvs.srv import Trigger
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
-from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag import BagWriter, open_bag
 from imu_fusion.nodes.flow import END, NEXT
 from imu_fusion.nodes.replayer import Replayer
 from test.nodes.conftest import START, STEP, collector, write_bag

@@ -10,10 +10,10 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError
-from imu_fusion.messages.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag import BagWriter, open_bag
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
-from imu_fusion.messages.smoothing import (
+from imu_fusion.streams.smoother import (
     OUTPUTS, RESULTS_TOPIC, Collection, newest_epoch, results_value)
 from imu_fusion.nodes.flow import END, FlowSink, reliable_qos
 from imu_fusion.nodes.replayer import Replayer

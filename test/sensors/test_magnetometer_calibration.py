@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import CalibrationError
-from imu_fusion.estimation.orientation import OrientationParams
+from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.sensors.magnetometer_calibration import (
     MagCalibrator, calibrate_magnetometer, coverage)
 

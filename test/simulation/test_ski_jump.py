@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.simulation.jump_sensors import EPOCH, PhoneErrors, period_means, record
 from imu_fusion.simulation.noise_gnss import GnssErrors, gauss_markov, gnss_errors
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
-from imu_fusion.surface_file import load_surface
+from imu_fusion.surfaces.file import load_surface
 
 
 @pytest.fixture(scope="module")

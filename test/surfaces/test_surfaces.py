@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import ImuFusionError, LayoutError
-from imu_fusion.surface_file import load_surface, surface_from_mapping
+from imu_fusion.surfaces.file import load_surface, surface_from_mapping
 from imu_fusion.surfaces.fis_hill import FisHill
 from imu_fusion.surfaces.profile import Arc, Line, Profile
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.events import find_jump, jump_result
+from imu_fusion.estimation.smoother.events import find_jump, jump_result
 from imu_fusion.estimation.smoother.extended_rts_model import (
     DA, DW, ENU_NED, Model, Q, R, SIZE, V, d_to_ned, rate_matrix, to_ned)
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors

@@ -14,7 +14,7 @@ needs. Both runs execute the same operations, so they agree bit for bit.
 import math
 
 import numpy as np
-from numba import njit
+from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.model import (ATT, BLOCKS, BODY_HEIGHT, CORE, FIX,
                                                   LEVER_ARM, POS, SURFACE_ARM, VEL, VELOCITY,
@@ -34,7 +34,7 @@ SEGMENT = 128
 THINNING = 16
 
 
-@njit(cache=True)
+@njit
 def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, innovation,
                    storage):
     """Filter samples first <= k < last; ``delta`` and ``cov`` are those before the rows of
@@ -204,7 +204,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
     return cost
 
 
-@njit(cache=True)
+@njit
 def _update(delta, cov, entries, used, count, residual, gain):
     """Scalar update with unit noise; ``gain`` (n,) becomes P h / sqrt(S).
 
@@ -234,7 +234,7 @@ def _update(delta, cov, entries, used, count, residual, gain):
     return normal, root
 
 
-@njit(cache=True)
+@njit
 def _store_row(at, entries, used, count, gain, value, root, r_entries, r_index, r_count, r_gain,
                r_value):
     for e in range(count):
@@ -245,7 +245,7 @@ def _store_row(at, entries, used, count, gain, value, root, r_entries, r_index, 
     r_value[at] = value
 
 
-@njit(cache=True)
+@njit
 def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_cov, step,
                    cov_out, var_out):
     """Backward pass over first <= k < last; the adjoints are those at ``last`` before its rows
@@ -333,7 +333,7 @@ def smooth_segment(first, last, x, adjoint, adjoint_cov, motion, storage, with_c
     return cost
 
 
-@njit(cache=True)
+@njit
 def _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out):
     """Blocks of P - P L P that are reported."""
     n = len(cov)
@@ -362,7 +362,7 @@ def _smoothed_cov(k, cov, adjoint_cov, slow, work, cov_out, var_out):
         var_out[k, i - 9] = total
 
 
-@njit(cache=True)
+@njit
 def make_storage(n_samples, n_rows, n):
     """Arrays for a segment of n_samples with n_rows rows and n error states."""
     return (np.empty((n_rows, MAX_ENTRIES)), np.empty((n_rows, MAX_ENTRIES), np.int64),
@@ -372,7 +372,7 @@ def make_storage(n_samples, n_rows, n):
             np.empty((n_samples, 3, n)), np.empty((n_samples, 3, 3)))
 
 
-@njit(cache=True)
+@njit
 def solve_linear(x, delta, cov, motion, measured, rows, innovation, with_cov, cov_out, var_out):
     """Solve the problem linearised about x (N, n + 1) and move x to its solution.
 

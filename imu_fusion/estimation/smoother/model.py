@@ -10,7 +10,7 @@ the velocities by the trapezoidal rule, so its derivative needs no storage of it
 """
 
 import numpy as np
-from numba import njit
+from imu_fusion.kernels import njit
 
 from imu_fusion.geometry.gravity import gravity_world
 from imu_fusion.geometry import quaternion
@@ -39,7 +39,7 @@ def make_layout(present):
     return layout, size
 
 
-@njit(cache=True)
+@njit
 def _cross_matrix(m, v, scale, out, row, column):
     """out[row:row+3, column:column+3] = scale * m @ [v]x."""
     for i in range(3):
@@ -48,7 +48,7 @@ def _cross_matrix(m, v, scale, out, row, column):
         out[row + i, column + 2] = scale * (m[i, 0] * v[1] - m[i, 1] * v[0])
 
 
-@njit(cache=True)
+@njit
 def _product(a, b):
     """a @ b for 3 x 3 matrices (the library call costs more than the product)."""
     out = np.empty((3, 3))
@@ -58,7 +58,7 @@ def _product(a, b):
     return out
 
 
-@njit(cache=True)
+@njit
 def interval(x, gyr, acc, dt, gravity, spin, decay, layout, f_vel, f_att, x_next, rate,
              force_world):
     """Carry the state x over one interval; derivatives of velocity and attitude.
@@ -143,7 +143,7 @@ def interval(x, gyr, acc, dt, gravity, spin, decay, layout, f_vel, f_att, x_next
     return start, middle
 
 
-@njit(cache=True)
+@njit
 def _scale_columns(x, rate, layout, h):
     """Columns of the gyroscope's scale in h (3, n), while those of its bias hold what the rate
     alone does: the scale enters the rate with the other sign, times the reading."""
@@ -155,7 +155,7 @@ def _scale_columns(x, rate, layout, h):
                 h[i, layout[GYR_SCALE] + j] = -gyr * h[i, GYR_BIAS + j]
 
 
-@njit(cache=True)
+@njit
 def predict_fix(x, tau, rate, force_world, rotation, lever, layout, h):
     """Antenna position (3,) at ``tau`` after the sample, and its derivative h (3, n).
 
@@ -192,7 +192,7 @@ def predict_fix(x, tau, rate, force_world, rotation, lever, layout, h):
     return predicted
 
 
-@njit(cache=True)
+@njit
 def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, columns, lever, layout, h):
     """Antenna velocity (3,) at ``tau`` after the sample, and its derivative h (3, n)."""
     cross = np.empty(3)
@@ -224,7 +224,7 @@ def predict_velocity(x, tau, dt, rate, force_world, rotation, f_vel, columns, le
     return predicted
 
 
-@njit(cache=True)
+@njit
 def predict_mag(x, tau, rate, rotation, field_world, layout, h):
     """Magnetometer reading (3,) at ``tau`` after the sample (Fang 2020, eq. 50), and h (3, n).
 

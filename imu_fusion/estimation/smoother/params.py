@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.parameters import Parameters, param
+from imu_fusion.parameters.declare import Parameters, param
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.events import find_jump, jump_result, refine_jump
+from imu_fusion.estimation.smoother.events import find_jump, jump_result, refine_jump
 from imu_fusion.estimation.smoother import initial, iterated, model
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
 from imu_fusion.estimation.smoother.inputs import (prepare_imu, prepare_measurements,

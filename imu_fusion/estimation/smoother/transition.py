@@ -7,13 +7,13 @@ states only decay.
 
 import math
 
-from numba import njit
+from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.model import ATT, POS, VEL
 from imu_fusion.geometry import quaternion
 
 
-@njit(cache=True)
+@njit
 def boxplus(x, delta):
     """State x (n + 1,) moved by an error state delta (n,), in place."""
     x[6:10] = quaternion.normalize(
@@ -24,7 +24,7 @@ def boxplus(x, delta):
         x[i + 1] += delta[i]
 
 
-@njit(cache=True)
+@njit
 def boxminus(a, b, out):
     """out (n,) with a = b [+] out, for states a, b (n + 1,)."""
     out[ATT:ATT + 3] = quaternion.log(
@@ -35,7 +35,7 @@ def boxminus(a, b, out):
         out[i] = a[i + 1] - b[i + 1]
 
 
-@njit(cache=True)
+@njit
 def propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
     """out = F @ m for a matrix m (n, k)."""
     n, width = m.shape
@@ -57,7 +57,7 @@ def propagate_rows(m, out, dt, decay, f_vel, f_att, columns):
             out[i, j] = decay[i] * m[i, j]
 
 
-@njit(cache=True)
+@njit
 def propagate_cov(cov, work, dt, decay, f_vel, f_att, columns):
     """cov = F @ cov @ F.T for a symmetric matrix (n, n), in place and exactly symmetric.
 
@@ -121,7 +121,7 @@ def propagate_cov(cov, work, dt, decay, f_vel, f_att, columns):
             cov[i, j] = cov[j, i] = decay[j] * work[i, j]
 
 
-@njit(cache=True)
+@njit
 def adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
     """out = F.T @ m for a matrix m (n, k)."""
     n, width = m.shape
@@ -143,7 +143,7 @@ def adjoint_rows(m, out, dt, decay, f_vel, f_att, columns):
                     out[c, j] += a * m[ATT + i, j]
 
 
-@njit(cache=True)
+@njit
 def interval_noise(q_acc, middle, dt, spread):
     """spread (3, 3): covariance of the velocity step in world axes."""
     for i in range(3):
@@ -153,13 +153,13 @@ def interval_noise(q_acc, middle, dt, spread):
                                  + middle[i, 2] * middle[j, 2] * q_acc[2])
 
 
-@njit(cache=True)
+@njit
 def slow_noise(walk, rate, dt, factor):
     """Variance that a slow state gains; factor is its decay over dt."""
     return walk * dt if rate == 0.0 else 0.5 * walk / rate * (1.0 - factor * factor)
 
 
-@njit(cache=True)
+@njit
 def apply_step(x, step, largest):
     """Move states x (m, n + 1) by deviations step (m, n), in place; ``largest`` (3,) grows to
     the largest change of position (m), velocity (m/s) and attitude (rad)."""

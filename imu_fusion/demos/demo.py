@@ -1,0 +1,106 @@
+"""``imu_fusion demo``: the main jobs on recordings, through real ROS 2 nodes."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from imu_fusion.demos import trajectory
+from imu_fusion.demos.impact import impact
+from imu_fusion.demos.trajectory import shared
+from imu_fusion.errors import ParameterError
+from imu_fusion.evaluation.orientation_error import (moving_at, orientation_errors, shares_within,
+                                                     statistics)
+from imu_fusion.nodes.processes import Graph
+from imu_fusion.recordings.bag import open_bag
+from imu_fusion.messages.convert import attitude_log, bool_value, read_log
+from imu_fusion.report.recording import write_recording_report
+
+
+def orientation(out, console):
+    """Play a BROAD trial through replayer, orientation_estimator and recorder."""
+    bag = shared("bags") / "broad_06_fast_rotation"
+    recording = out / "recording"
+    started = time.monotonic()
+    with Graph(out / "logs") as graph:
+        graph.start("recorder", out=str(recording), overwrite=True)
+        graph.start("orientation_estimator", qos="reliable")
+        graph.start("replayer", show=True, bag=str(bag), rate=0.0,
+                    wait_for_nodes=("recorder", "orientation_estimator"))
+        graph.wait("replayer", 300)
+        graph.finish("recorder", 30.0)
+    elapsed = time.monotonic() - started
+
+    with open_bag(bag) as played, open_bag(recording) as recorded:
+        duration = (played.end_time - played.start_time) * 1e-9
+        console.print(_message_table(played, recorded))
+        errors, moving = compare(played, recorded)
+    console.print(_error_table(errors, moving))
+    report = out / "report.html"
+    write_recording_report(bag, recording, report)
+    console.print(f"{duration:.0f} s of data in {elapsed:.0f} s through three ROS 2 processes "
+                  f"(domain {graph.domain})\nrecording: {recording}\nreport:    {report}")
+
+
+def compare(played, recorded):
+    """Errors of the recorded imu/data against the reference of what was played.
+
+    Returns:
+        (OrientationErrors, movement mask (n,) bool or None if the recording has none)
+    """
+    estimates = read_log(recorded, "imu/data", attitude_log)
+    errors = orientation_errors(estimates.stamp, estimates.quat_world_imu,
+                                read_log(played, "reference/pose"), estimates.cov_attitude)
+    changes = [(log_time, bool_value(cdr)) for _, _, log_time, cdr
+               in played.messages(["/reference/moving"])]
+    if not changes:
+        return errors, None
+    stamps, values = zip(*changes)
+    return errors, moving_at(errors.stamp, np.array(stamps), np.array(values))
+
+
+def _message_table(played, recorded):
+    table = Table("topic", "played", "recorded", "lost", title="messages")
+    for name, info in sorted(recorded.topics.items()):
+        source = played.topics.get(name)
+        if source is None and name in ("/imu/data", "/imu/rpy/filtered"):
+            source = played.topics["/imu/data_raw"]  # one estimate per Imu
+        lost = "" if source is None else str(source.count - info.count)
+        table.add_row(name, "" if name not in played.topics else str(source.count),
+                      str(info.count), lost)
+    return table
+
+
+def _error_table(errors, moving):
+    table = Table("error angle", "RMSE deg", "median", "95 %", "largest",
+                  title="orientation against the optical reference, while moving")
+    for row in statistics(errors, moving):
+        table.add_row(row.name, f"{row.rmse_deg:.2f}", f"{row.median_deg:.2f}",
+                      f"{row.p95_deg:.2f}", f"{row.maximum_deg:.2f}")
+    for name, (_, _, three) in shares_within(errors, moving).items():
+        table.add_row(f"{name} within 3 sigma", f"{100 * three:.1f} %", "", "", "")
+    return table
+
+
+DEMOS = {"orientation": orientation, "impact": impact, "drive": trajectory.drive,
+         "jump": trajectory.jump}
+
+
+def run(name, out, console):
+    """Run a demo.
+
+    Args:
+        name: one of DEMOS.
+        out: directory for its files.
+        console: rich Console.
+
+    Raises:
+        ParameterError: no such demo.
+        ImuFusionError: a node failed.
+    """
+    if name not in DEMOS:
+        raise ParameterError(f"no demo '{name}'; there are: {', '.join(DEMOS)}")
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    DEMOS[name](out, console)

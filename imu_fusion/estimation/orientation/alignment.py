@@ -1,0 +1,204 @@
+"""Initial orientation from a first interval at rest: Winkler 2025, eqs. (12)-(14).
+
+The interval's samples are first carried into the axes of its first sample by
+the gyroscope, so that slow turning does not blur the means, and a start in
+motion still gives an initial orientation, with the uncertainty that it has.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from imu_fusion.kernels import njit
+
+from imu_fusion.estimation.orientation import mag_limit as limit
+from imu_fusion.geometry import quaternion
+from imu_fusion.geometry.rotation import quat_from_matrix
+from imu_fusion.sensors.saturation import saturated_axes
+
+# Largest rate that can be a gyroscope's bias, and largest scatter of rate and specific
+# force that passes as rest on a table or in a quiet hand (consumer MEMS, Nyquist-band noise).
+_BIAS_LIMIT = 0.2          # rad/s
+_REST_RATE_SCATTER = 0.05  # rad/s
+_REST_ACC_SCATTER = 0.4    # m/s^2
+_STANDARD_GRAVITY = 9.80665
+# Field norms that differ by more than this factor from their median are outliers: hard iron
+# and motion change them by less.
+_NORM_FACTOR = 3.0
+# Below this share of the field horizontal, heading is noise: the magnetic poles.
+_HORIZONTAL_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What the first interval says.
+
+    quat_world_imu (4,) at its first sample; cov_attitude_world (3, 3) rad^2;
+    field_world (3,) tesla or None; gyr_bias (3,), gyr_bias_sd rad/s; at_rest;
+    has_heading: whether a magnetometer fixed the heading; inclination (rad, down
+    positive) and field_norm (tesla) of the mean field, nan without one; gravity
+    (m/s^2): norm of the mean specific force at rest, else the standard one.
+    """
+
+    quat_world_imu: np.ndarray
+    cov_attitude_world: np.ndarray
+    field_world: np.ndarray | None
+    gyr_bias: np.ndarray
+    gyr_bias_sd: float
+    at_rest: bool
+    has_heading: bool
+    inclination: float
+    field_norm: float
+    gravity: float
+
+
+def triad(acc, mag, declination):
+    """Initial orientation, eqs. (12)-(14).
+
+    Args:
+        acc: (3,) specific force at rest, imu axes.
+        mag: (3,) magnetic field, imu axes.
+        declination: rad, positive where magnetic north lies east of true north.
+
+    Returns:
+        (3, 3) R_world_imu: rows are the world's east, north and up in imu axes.
+    """
+    up = acc / np.linalg.norm(acc)
+    east_mag = np.cross(mag, up)
+    east_mag /= np.linalg.norm(east_mag)
+    north_mag = np.cross(up, east_mag)
+    # Magnetic north lies D east of north: n_mag = cos D north + sin D east.
+    east = math.cos(declination) * east_mag + math.sin(declination) * north_mag
+    north = -math.sin(declination) * east_mag + math.cos(declination) * north_mag
+    return np.array([east, north, up])
+
+
+def usable_mags(mag, ranges):
+    """Mask (m,) of the samples of the first interval that measure the field.
+
+    Left out are samples with an axis at its limit, also those before the limit was
+    recognised, and outliers.
+
+    Args:
+        mag: (m, 3) tesla, finite, as the sensor reports it. ranges: (3,) tesla or nan.
+    """
+    if len(mag) == 0:
+        return np.zeros(0, dtype=bool)
+    floats, ints = np.zeros(limit.FLOATS), np.zeros(limit.INTS, dtype=np.int64)
+    for _ in range(2):
+        usable = np.array([not limit.is_saturated(floats, ints, ranges, sample)
+                           for sample in mag])
+    norm = np.linalg.norm(mag, axis=1)
+    if usable.any():
+        median = np.median(norm[usable])
+        usable &= (norm < _NORM_FACTOR * median) & (norm > median / _NORM_FACTOR)
+    return usable
+
+
+@njit
+def _chain(stamps, gyr):
+    """(n, 4) rotations from each sample's axes into the first's, by trapezoidal rates."""
+    chain = np.empty((len(stamps), 4))
+    quat = (0.0, 0.0, 0.0, 1.0)
+    chain[0] = quat
+    for i in range(1, len(stamps)):
+        dt = (stamps[i] - stamps[i - 1]) * 1e-9
+        twice = (gyr[i - 1, 0] + gyr[i, 0], gyr[i - 1, 1] + gyr[i, 1], gyr[i - 1, 2] + gyr[i, 2])
+        quat = quaternion.multiply(quat, quaternion.exp(twice, 0.5 * dt))
+        chain[i] = quat
+    return chain
+
+
+@njit
+def _rotate_all(chain, vectors):
+    out = np.empty_like(vectors)
+    for i in range(len(vectors)):
+        out[i] = quaternion.rotate(chain[i], vectors[i])
+    return out
+
+
+def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr_density,
+          gyr_bias_sd, acc_bias_sd, mag_sd, gyr_limits=math.inf):
+    """Initial orientation, gyroscope bias and field from the first samples.
+
+    Args:
+        imu_stamps: (n,) int64 ns, n >= 1.
+        gyr, acc: (n, 3) rad/s, m/s^2.
+        mag_stamps, mag: (m,), (m, 3) tesla, calibrated; m may be 0.
+        declination, yaw_offset: rad; yaw_offset turns the result about up.
+        gyr_density: rad/s/sqrt(Hz).
+        gyr_bias_sd: rad/s, of a bias that was not seen at rest.
+        acc_bias_sd: m/s^2.
+        mag_sd: tesla, of one sample.
+        gyr_limits: rad/s, scalar or (3,). From a rate at its limit on nobody knows how the
+            sensor turned: only samples before it are used.
+
+    Returns:
+        Alignment. Never raises for poor data: the covariance says how poor.
+    """
+    n = len(imu_stamps)
+    duration = max((imu_stamps[-1] - imu_stamps[0]) * 1e-9, 1e-2)
+    rate_mean = gyr.mean(axis=0)
+    scatter = gyr.std(axis=0).max()
+    at_rest = bool(n > 2 and np.linalg.norm(rate_mean) < _BIAS_LIMIT
+                   and scatter < _REST_RATE_SCATTER
+                   and acc.std(axis=0).max() < _REST_ACC_SCATTER)
+    if at_rest:
+        bias = rate_mean
+        # Hands are never quite still: what the halves disagree by is not known as bias.
+        drift = np.abs(gyr[:n // 2].mean(axis=0) - gyr[n // 2:].mean(axis=0)).max()
+        bias_sd = math.hypot(gyr_density / math.sqrt(duration), 0.5 * drift)
+    else:
+        bias, bias_sd = np.zeros(3), gyr_bias_sd
+    lost = np.flatnonzero(saturated_axes(gyr, gyr_limits).any(axis=1))
+    used = max(int(lost[0]), 1) if len(lost) else n
+    chain = _chain(imu_stamps[:used], gyr[:used] - bias)
+
+    acc_first = _rotate_all(chain, acc[:used])
+    up_force = acc_first.mean(axis=0)
+    gravity = float(np.linalg.norm(up_force))
+    if gravity < 1e-3:
+        # Free fall or no accelerometer: any tilt is as good as any other.
+        up_force = np.array([0.0, 0.0, 1.0])
+        tilt_variance = 1.0
+    else:
+        # A quarter of the interval per independent mean: motion is correlated.
+        wander = acc_first.std(axis=0).max() / 2.0 if not at_rest else 0.0
+        excess = abs(gravity - _STANDARD_GRAVITY) if not at_rest else 0.0
+        if used < n:
+            # Too short to show how the force wanders: its norm does, whatever the attitude.
+            norm = np.linalg.norm(acc, axis=1)
+            wander = max(wander, math.sqrt(np.mean((norm - _STANDARD_GRAVITY) ** 2)))
+        tilt_variance = min((acc_bias_sd ** 2 + wander ** 2 + excess ** 2) / gravity ** 2, 1.0)
+        if not at_rest:
+            gravity = _STANDARD_GRAVITY    # what is seen is motion, too
+    up = up_force / np.linalg.norm(up_force)
+
+    nan = float("nan")
+    field_first, inclination, field_norm, has_heading = None, nan, nan, False
+    if len(mag):
+        nearest = np.searchsorted(imu_stamps, mag_stamps)
+        mag = mag[:max(int(np.sum(nearest < used)), 1)]
+        nearest = np.clip(nearest[:len(mag)], 0, used - 1)
+        field_first = _rotate_all(chain[nearest], np.ascontiguousarray(mag)).mean(axis=0)
+        field_norm = float(np.linalg.norm(field_first))
+        inclination = math.asin(np.clip(-(field_first @ up) / max(field_norm, 1e-30), -1, 1))
+        has_heading = math.cos(inclination) > _HORIZONTAL_SHARE
+    if has_heading:
+        r = triad(up, field_first, declination)
+        horizontal = field_norm * math.cos(inclination)
+        heading_variance = ((mag_sd / horizontal) ** 2 / len(mag)
+                            + math.tan(inclination) ** 2 * tilt_variance)
+    else:
+        # Yaw zero, x towards east; where x is near the vertical, y towards north.
+        north = np.cross(up, [1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        r = triad(up, north, 0.0)
+        heading_variance = math.pi ** 2 / 3.0   # uniform over the circle
+    c, s = math.cos(yaw_offset), math.sin(yaw_offset)
+    r = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ r
+    return Alignment(
+        quat_world_imu=quat_from_matrix(r),
+        cov_attitude_world=np.diag([tilt_variance, tilt_variance, heading_variance]),
+        field_world=None if field_first is None else r @ field_first,
+        gyr_bias=bias, gyr_bias_sd=float(bias_sd), at_rest=at_rest, has_heading=has_heading,
+        inclination=inclination, field_norm=field_norm, gravity=gravity)

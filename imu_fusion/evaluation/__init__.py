@@ -1,0 +1,1 @@
+"""Estimates against a truth: errors, shares within sigma, NEES. Nothing here estimates."""

@@ -1,0 +1,158 @@
+"""Our nodes as processes of an own ROS domain: for demo, pipeline and benchmarks."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import yaml
+
+from imu_fusion.kernels import NOTICE
+from imu_fusion.errors import ImuFusionError
+
+
+class GraphError(ImuFusionError):
+    """A node did not start, did not end or ended with an error."""
+
+
+def free_domain():
+    """A ROS domain id (1 to 101) that nobody on this machine uses.
+
+    DDS participants of a domain bind the UDP ports from 7400 + 250 * id on.
+    """
+    first = os.getpid() % 101
+    for i in range(101):
+        domain = 1 + (first + i) % 101
+        if all(_is_free(7400 + 250 * domain + offset) for offset in (0, 10, 11, 12)):
+            return domain
+    raise GraphError("all ROS domain ids from 1 to 101 are in use on this machine")
+
+
+def _is_free(port):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+    return True
+
+
+class Graph:
+    """Processes of our nodes; leaving the context ends those that still run.
+
+    Args:
+        logs: directory for what the nodes print, one file per node; a temporary
+            one if None.
+        domain: ROS domain id, a free one if None.
+    """
+
+    def __init__(self, logs=None, domain=None):
+        self.domain = free_domain() if domain is None else domain
+        self._logs = Path(logs or tempfile.mkdtemp(prefix="imu_fusion_"))
+        self._logs.mkdir(parents=True, exist_ok=True)
+        self._processes = {}
+        self._announced = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for process in self._processes.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + 15.0
+        for process in self._processes.values():
+            try:
+                process.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def start(self, node, show=False, params_file=None, **parameters):
+        """Start a node.
+
+        Args:
+            node: module name in imu_fusion.nodes.
+            show: let it print here instead of into its log.
+            params_file: ROS 2 parameter file.
+            parameters: its parameters; empty tuples, which rclpy cannot read, are left out.
+        """
+        command = [sys.executable, "-m", "imu_fusion.cli", "run", node, "--ros-args"]
+        if params_file is not None:
+            command += ["--params-file", str(params_file)]
+        if parameters:
+            own = self._logs / f"{node}.yaml"
+            own.write_text(yaml.safe_dump({node: {"ros__parameters": {
+                k: list(v) if isinstance(v, tuple) else v
+                for k, v in parameters.items() if v != ()}}}))
+            command += ["--params-file", str(own)]
+        environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain),
+                           ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", PYTHONUNBUFFERED="1")
+        with open(self._logs / f"{node}.log", "w") as log:
+            self._processes[node] = subprocess.Popen(
+                command, env=environment, stdin=subprocess.DEVNULL,
+                stdout=None if show else log, stderr=None if show else subprocess.STDOUT,
+                start_new_session=True)
+
+    def wait(self, node, timeout):
+        """Wait until a node has ended by itself; seconds.
+
+        Raises:
+            GraphError: this or another node failed, or it took too long; with its last words.
+        """
+        deadline = time.monotonic() + timeout
+        while self._processes[node].poll() is None:
+            self._announce_compiling()
+            for name, process in self._processes.items():
+                if process.poll():
+                    raise GraphError(f"node {name} ended with code {process.returncode}: "
+                                     f"{self._last_words(name)}")
+            if time.monotonic() > deadline:
+                raise GraphError(f"node {node} has not ended after {timeout:g} s: "
+                                 f"{self._last_words(node)}")
+            time.sleep(0.05)
+        if self._processes[node].returncode:
+            raise GraphError(f"node {node} ended with code {self._processes[node].returncode}: "
+                             f"{self._last_words(node)}")
+
+    def finish(self, node, patience, progress=lambda: None):
+        """Wait for the end of a node; ask it to end (as Ctrl-C does) when nothing moves any more.
+
+        Args:
+            patience: seconds in which ``progress()`` may stay the same.
+
+        Returns:
+            Whether the node ended by itself.
+
+        Raises:
+            GraphError: as :meth:`wait`.
+        """
+        process, seen, since = self._processes[node], progress(), time.monotonic()
+        while process.poll() is None and time.monotonic() - since < patience:
+            time.sleep(0.05)
+            now = progress()
+            if now != seen:
+                seen, since = now, time.monotonic()
+        by_itself = process.poll() is not None
+        if not by_itself:
+            process.send_signal(signal.SIGINT)
+        self.wait(node, 15.0)
+        return by_itself
+
+    def _announce_compiling(self):
+        """Say once what a node says into its log only."""
+        if not self._announced and any(NOTICE in self.log(node) for node in self._processes):
+            self._announced = True
+            print(NOTICE, file=sys.stderr, flush=True)
+
+    def log(self, node):
+        """What a node has printed so far."""
+        return (self._logs / f"{node}.log").read_text(errors="replace")
+
+    def _last_words(self, node):
+        lines = self.log(node).strip().splitlines()
+        return " | ".join(lines[-3:]) or f"nothing in {self._logs / (node + '.log')}"

@@ -1,0 +1,1 @@
+"""Parameters: declared once as frozen dataclasses; ROS, YAML, command line and docs from them."""

@@ -1,0 +1,110 @@
+"""ROS 2 parameter files, read without ROS: the same file serves nodes and batch."""
+
+from pathlib import Path
+
+import yaml
+
+from imu_fusion.errors import ParameterError
+from imu_fusion.parameters.declare import flatten
+
+
+def load(path):
+    """Read a parameter file.
+
+    Args:
+        path: YAML keyed by node name (``name:``, ``/ns/name:`` or ``/**:``), each with
+            ``ros__parameters``.
+
+    Returns:
+        dict of node name to (nested) parameters; wildcards under ``**``.
+
+    Raises:
+        ParameterError: not readable, not YAML, or not of that form.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{path}: is not YAML: {error}") from None
+    if content is None:
+        return {}
+    nodes = {}
+    for key, body in _walk(path, content):
+        nodes.setdefault(key, {}).update(body)
+    return nodes
+
+
+def _walk(path, content, prefix=""):
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: '{prefix or 'the top level'}' must map node names to "
+                             "'ros__parameters'")
+    for key, body in content.items():
+        if isinstance(body, dict) and "ros__parameters" in body:
+            name = str(key).rstrip("/").rpartition("/")[2]
+            yield name, body["ros__parameters"] or {}
+        else:
+            yield from _walk(path, body, f"{prefix}{key}/")
+
+
+def parameters_for(classes, node, path=None, ignore=()):
+    """The parameters of one node from a file, or its defaults without one.
+
+    Args:
+        classes: the :class:`~imu_fusion.parameters.declare.Parameters` classes of the node.
+        node: node name; ``/**`` in the file applies to every node, with the names known to it.
+        path: the file, or None.
+        ignore: names (or prefixes ending in a dot) that are read by somebody else.
+
+    Returns:
+        list of one object per class.
+
+    Raises:
+        ParameterError: unknown name, wrong type, value out of bounds; names the file.
+    """
+    if path is None:
+        return [cls() for cls in classes]
+    known = {info.name for cls in classes for info in cls.infos()}
+    values = node_values(node, path, known)
+    resolve_paths(values, classes, node, [path])
+    result = []
+    for cls in classes:
+        own = {info.name for info in cls.infos()}
+        result.append(cls.from_mapping(values, source=str(path), ignore=(*ignore, *(known - own))))
+    return result
+
+
+def resolve_paths(values, classes, node, paths):
+    """Relative file names that parameter files set become relative to those files.
+
+    Args:
+        values: flat mapping of parameter names to values, changed in place. A file name that
+            does not exist beside the parameter file stays as it is.
+        classes, node: as for :func:`parameters_for`.
+        paths: the parameter files that the values may come from, the last one counts.
+    """
+    names = {info.name for cls in classes for info in cls.infos() if info.path}
+    settings = [(path, node_values(node, path, names)) for path in paths]
+    for name in names:
+        value = values.get(name)
+        for path, own in reversed(settings):
+            if value and own.get(name) == value:
+                candidate = Path(path).absolute().parent / value
+                if candidate.exists():
+                    values[name] = str(candidate)
+                break
+
+
+def node_values(node, path, known):
+    """Names and values, dotted, that a file gives to a node: of ``/**`` only the known ones.
+
+    An empty dict without a file (path None).
+    """
+    if path is None:
+        return {}
+    nodes = load(path)
+    values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
+    values.update(flatten(nodes.get(node, {})))
+    values.pop("use_sim_time", None)
+    return values

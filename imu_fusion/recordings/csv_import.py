@@ -1,0 +1,298 @@
+"""Tables of accelerometers (CSV) as recordings: a YAML description instead of a program.
+
+    delimiter: ","             # or "tab", "space" (any white space)
+    skip_lines: 0              # ahead of the line of column names
+    header: true               # false: there are no names, columns are numbered from 1
+    time: {column: t, unit: ms, start: 1700000000.0}     # or {rate: 1000.0}
+    position_unit: mm
+    accelerometers:
+      front:
+        columns: [a1x, a1y, a1z]       # of the measured axes, in the order x, y, z
+        unit: g
+        position: [150, 0, 0]          # and all else that describes an accelerometer
+    gyroscope: {columns: [wx, wy, wz], unit: deg/s}      # if there is one
+    parameters: {points: [0.0, 0.0, 0.05]}               # further ones of the estimator
+
+The result is a recording and a parameter file of the acceleration field estimator for it.
+"""
+
+import csv
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from imu_fusion.errors import BagError, ParameterError, SampleError
+from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
+from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.streams.acceleration_field import (GYROSCOPE_TOPIC, NODE,
+                                                           NODE_PARAMETERS, FieldConfiguration)
+from imu_fusion.recordings.bag import BagWriter
+from imu_fusion.messages.convert import imu_message
+from imu_fusion.messages.layouts import IMU, NANOSECONDS
+from imu_fusion.parameters.declare import Parameters, flatten, param
+
+TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
+ACCELERATION_UNITS = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
+RATE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+_DELIMITERS = {"tab": "\t", "space": None}
+_SENSOR_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class TableParams(Parameters):
+    """How the table is written."""
+
+    delimiter: str = param(",", doc="Between two cells: one character, 'tab' or 'space'.")
+    skip_lines: int = param(0, low=0, doc="Lines ahead of the column names.")
+    header: bool = param(True, doc="Whether a line of column names leads the rows.")
+    time__column: str | None = param(None, doc="Column of the times.")
+    time__unit: str = param("s", choices=tuple(TIME_UNITS), doc="Unit of the times.")
+    time__start: float = param(0.0, unit="s", low=0, doc="Added to the times.")
+    time__rate: float | None = param(None, unit="Hz", low=1e-3, doc="If there are no times.")
+    position_unit: str = param("m", choices=tuple(LENGTH_UNITS), doc="Unit of the positions.")
+
+
+@dataclass(frozen=True)
+class _AccelerometerColumns(Parameters):
+    columns: tuple[str, ...] = param((), doc="Columns of the measured axes, x before y before z.")
+    unit: str = param("m/s^2", choices=tuple(ACCELERATION_UNITS), doc="Unit of the columns.")
+
+
+@dataclass(frozen=True)
+class _GyroscopeColumns(Parameters):
+    columns: tuple[str, ...] = param((), length=3, doc="Columns of x, y and z.")
+    unit: str = param("rad/s", choices=tuple(RATE_UNITS), doc="Unit of the columns.")
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """What to read of one sensor: (column, axis) pairs, factor to SI, its parameters."""
+
+    topic: str
+    pairs: tuple
+    factor: float
+    params: Parameters
+
+    def messages(self, stamps, table, frame_id):
+        """Yield (stamp, cdr)."""
+        values = np.zeros((len(stamps), 3))
+        for column, axis in self.pairs:
+            values[:, axis] = table[column] * self.factor
+        rates = isinstance(self.params, GyroscopeParams)
+        for stamp, value in zip(stamps, values):
+            gyr, acc = (value, None) if rates else (None, value)
+            yield int(stamp), imu_message(stamp, frame_id, gyr, acc)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes all strings: the parser of ROS takes a bare y, n or on for a truth value."""
+
+
+_Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar(
+    "tag:yaml.org,2002:str", text, style='"'))
+
+
+def import_csv(source, description, out, overwrite=False):
+    """Convert a table to a recording and, beside it, a parameter file.
+
+    Args:
+        source: CSV file.
+        description: YAML file, see the module.
+        out: rosbag2 directory to write; the parameter file is ``<out>.yaml``.
+        overwrite: replace both.
+
+    Returns:
+        (path of the parameter file, number of rows)
+
+    Raises:
+        ImuFusionError: names the file with the line, column, unit or parameter that is wrong.
+    """
+    out = Path(out)
+    parameter_file = out.with_name(out.name + ".yaml")
+    if parameter_file.exists() and not overwrite:
+        raise BagError(f"{parameter_file}: exists already; choose another name or --overwrite")
+    table_params, sensors, given = _read_description(description)
+    columns = {column for sensor in sensors for column, _ in sensor.pairs}
+    stamps, table = _read_table(source, table_params, columns)
+    values = _parameters(sensors, given, stamps)
+    config = FieldConfiguration.from_mapping(values, str(description))
+    config.make_estimator()  # a layout that cannot work is refused before anything is written
+    rows = [(stamp, topic_rank, sensor.topic, cdr) for topic_rank, sensor in enumerate(sensors)
+            for stamp, cdr in sensor.messages(stamps, table, config.matching.body_frame)]
+    rows.sort(key=lambda row: row[:2])
+    with BagWriter(out, overwrite=overwrite) as writer:
+        for stamp, _, topic, cdr in rows:
+            writer.write("/" + topic, IMU.msgtype, cdr, stamp)
+    try:
+        parameter_file.write_text(
+            f"# Made from {Path(source).name} as {Path(description).name} says.\n"
+            + yaml.dump({NODE: {"ros__parameters": values}}, Dumper=_Dumper, sort_keys=False,
+                        default_flow_style=None, width=100))
+    except OSError as error:
+        raise BagError(f"{parameter_file}: cannot be written ({error.strerror})") from None
+    return parameter_file, len(stamps)
+
+
+def _read_description(path):
+    """(TableParams, list of _Sensor, dict of the other parameters) of a description."""
+    try:
+        content = yaml.safe_load(Path(path).read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ParameterError(f"{path}: not a readable YAML description: {error}") from None
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: must map names to values; see the documentation of convert")
+    arrays, gyroscope, given = (_mapping(content.pop(key, None), key, path)
+                                for key in ("accelerometers", "gyroscope", "parameters"))
+    if isinstance(content.get("time"), dict) and "column" in content["time"]:
+        content["time"] = {**content["time"], "column": str(content["time"]["column"])}
+    table = TableParams.from_mapping(content, str(path))
+    if (table.time__column is None) == (table.time__rate is None):
+        raise ParameterError(f"{path}: give either time.column or time.rate")
+    if len(table.delimiter) != 1 and table.delimiter not in _DELIMITERS:
+        raise ParameterError(f"{path}: delimiter '{table.delimiter}' is not one character, "
+                             + " or ".join(f"'{name}'" for name in _DELIMITERS))
+    scale = LENGTH_UNITS[table.position_unit]
+    sensors = [_accelerometer(name, values, scale, path) for name, values in arrays.items()]
+    if not sensors:
+        raise ParameterError(f"{path}: names no accelerometers")
+    if gyroscope:
+        read, params = _split(gyroscope, _GyroscopeColumns, GyroscopeParams,
+                              f"{path}: gyroscope")
+        sensors.append(_Sensor(GYROSCOPE_TOPIC, tuple(zip(read.columns, range(3))),
+                               RATE_UNITS[read.unit], params))
+    return table, sensors, given
+
+
+def _mapping(value, name, path):
+    if not isinstance(value or {}, dict):
+        raise ParameterError(f"{path}: '{name}' must map names to values")
+    return value or {}
+
+
+def _accelerometer(name, values, scale, path):
+    values = _mapping(values, f"accelerometers.{name}", path)
+    if not str(name).isidentifier() or not str(name).isascii():
+        raise ParameterError(f"{path}: accelerometer '{name}' would be part of a topic: letters, "
+                             "digits and underscores only, no digit first")
+    read, params = _split(values, _AccelerometerColumns, AccelerometerParams,
+                          f"{path}: accelerometers.{name}")
+    params = params.replace(position=tuple(scale * v for v in params.position))
+    axes = [k for k, axis in enumerate(_SENSOR_AXES) if axis in params.measured_axes]
+    if len(read.columns) != len(axes):
+        raise ParameterError(f"{path}: accelerometers.{name}: {len(read.columns)} columns for "
+                             f"the measured axes {', '.join(_SENSOR_AXES[k] for k in axes)}")
+    return _Sensor(f"accelerometers/{name}", tuple(zip(read.columns, axes)),
+                   ACCELERATION_UNITS[read.unit], params)
+
+
+def _split(values, columns_class, params_class, source):
+    """What the table says of a sensor and what the estimator must know of it."""
+    names = {info.name for info in columns_class.infos()}
+    own = {key: value for key, value in values.items() if key in names}
+    if isinstance(own.get("columns"), list):
+        own["columns"] = [str(column) for column in own["columns"]]
+    else:
+        raise ParameterError(f"{source}: 'columns' must list the columns of the table")
+    return (columns_class.from_mapping(own, source),
+            params_class.from_mapping({k: v for k, v in values.items() if k not in names}, source))
+
+
+def _read_table(source, params, columns):
+    """(stamps (n,) int64, dict of column to (n,) float64, NaN for empty cells) of a table."""
+    try:
+        with open(source, newline="", encoding="utf-8-sig") as stream:
+            for _ in range(params.skip_lines):
+                stream.readline()
+            delimiter = _DELIMITERS.get(params.delimiter, params.delimiter)
+            lines = (csv.reader(stream, delimiter=delimiter) if delimiter is not None
+                     else (line.split() for line in stream))
+            rows = [(number, row) for number, row in enumerate(lines, params.skip_lines + 1)
+                    if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise BagError(f"{source}: cannot be read ({error.strerror})") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise SampleError(f"{source}: not a table of text: {error}") from None
+    names = [str(i + 1) for i in range(len(rows[0][1]))] if rows else []
+    if params.header and rows:
+        names = [cell.strip() for cell in rows.pop(0)[1]]
+    if len(rows) < 2:
+        raise SampleError(f"{source}: {len(rows)} rows of numbers; is skip_lines or header right?")
+    wanted = sorted(columns) + ([params.time__column] if params.time__column else [])
+    for name in wanted:
+        if names.count(name) != 1:
+            raise ParameterError(
+                f"{source}: {'no' if name not in names else 'more than one'} column '{name}'; "
+                f"there are: {', '.join(names)}")
+    table = {name: np.array([read_number(source, number, name, row, names.index(name))
+                             for number, row in rows]) for name in columns}
+    if params.time__column is None:
+        since = np.round(np.arange(len(rows)) * (NANOSECONDS / params.time__rate))
+        return since.astype(np.int64) + round(params.time__start * NANOSECONDS), table
+    place = names.index(params.time__column)
+    stamps = np.array([_stamp(source, number, row, place, params) for number, row in rows])
+    if stamps.min() < 0:
+        raise SampleError(f"{source}: column '{params.time__column}' begins at "
+                          f"{stamps.min() * 1e-9:g} s; stamps cannot be negative: give time.start")
+    return stamps, table
+
+
+def _cell(source, line, name, row, place):
+    if place >= len(row):
+        raise SampleError(f"{source}, line {line}: {len(row)} cells, column '{name}' is missing")
+    return row[place].strip()
+
+
+def read_number(source, line, name, row, place):
+    """The number in cell ``place`` of a row, NaN if empty; SampleError names what it is not."""
+    text = _cell(source, line, name, row, place)
+    try:
+        return float(text) if text else np.nan
+    except ValueError:
+        raise SampleError(f"{source}, line {line}, column '{name}': '{text}' is not a number"
+                          ) from None
+
+
+def _stamp(source, line, row, place, params):
+    text = _cell(source, line, params.time__column, row, place)
+    try:
+        # Seconds since 1970 exceed what a float tells apart in nanoseconds.
+        since = Decimal(text).scaleb(TIME_UNITS[params.time__unit])
+        return int(since.to_integral_value()) + round(params.time__start * NANOSECONDS)
+    except (InvalidOperation, ValueError, OverflowError):
+        raise SampleError(f"{source}, line {line}, column '{params.time__column}': '{text}' is "
+                          "not a time") from None
+
+
+def _changed(params):
+    """The parameters that differ from their defaults."""
+    defaults = type(params)().to_mapping()
+    return {name: value for name, value in params.to_mapping().items()
+            if value != defaults.get(name)}
+
+
+def _parameters(sensors, given, stamps):
+    """Nested ROS parameters of the estimator; the sample rate from the stamps if not given."""
+    arrays = {s.topic.rpartition("/")[2]: {"position": list(s.params.position),
+                                           **_changed(s.params)} for s in sensors
+              if isinstance(s.params, AccelerometerParams)}
+    values = {"accelerometers": {"names": list(arrays), **arrays}}
+    # The noise is written in any case: a group without parameters would not exist.
+    values |= {"gyroscope": {"noise_density": s.params.noise_density, **_changed(s.params)}
+               for s in sensors if isinstance(s.params, GyroscopeParams)}
+    flat = flatten(given)
+    if "sample_rate" not in flat:
+        step = np.median(np.diff(stamps))
+        if step <= 0:
+            raise SampleError("the times of the table do not increase; is time.unit right?")
+        flat["sample_rate"] = float(NANOSECONDS / step)
+    known = {info.name: info for cls in NODE_PARAMETERS for info in cls.infos()}
+    for name, value in flat.items():
+        # In the types that ROS asks for: 1 is no floating point number there.
+        if name in known:
+            value = known[name].check(value, "parameters")
+        values[name] = list(value) if isinstance(value, tuple) else value
+    return values

@@ -1,0 +1,229 @@
+"""The acceleration field estimator between its topics, live and in batch."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
+                                                      AccelerationFieldParams, GyroscopeParams,
+                                                      parse_configuration)
+from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED, field_at
+from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
+from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.messages.convert import SampleType, imu_message
+from imu_fusion.messages.layouts import ACCEL, IMU
+from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
+from imu_fusion.streams.stream import EstimatorNodeParams, Stream
+from imu_fusion.parameters.declare import Parameters, flatten, param
+from imu_fusion.samples import AccelerometerLog, ImuLog
+from imu_fusion.samples.matching import SampleMatcher
+from imu_fusion.samples.merge import merge_order
+
+NODE = "acceleration_field_estimator"
+GYROSCOPE_TOPIC = "imu/data_raw"
+IMU_TOPIC = "acceleration_field/imu"
+ACCEL_TOPIC = "acceleration_field/accel"
+POINTS_TOPIC = "acceleration_field/points"
+OUTPUTS = {IMU_TOPIC: IMU.msgtype, ACCEL_TOPIC: ACCEL.msgtype, POINTS_TOPIC: POINT_CLOUD_TYPE}
+# Names below these belong to single sensors, however many there are.
+SENSOR_PREFIXES = ("accelerometers.", "gyroscope.")
+_FIELDS = ("x", "y", "z", "ax", "ay", "az", "magnitude")
+
+
+@dataclass(frozen=True)
+class MatchingParams(Parameters):
+    """How samples of several accelerometers become one, and how the body is called."""
+
+    match__tolerance: float = param(
+        1e-4, unit="s", low=0, doc="Stamps that differ by no more belong to one sample.")
+    match__hold: float = param(
+        0.02, unit="s", low=0, doc="A sample waits no longer for a missing accelerometer.")
+    body_frame: str = param("body", doc="frame_id of the body in everything published.")
+
+
+def _acc_values(values):
+    return values[..., IMU["linear_acceleration"]]
+
+
+def _gyr_values(values):
+    return values[..., IMU["angular_velocity"]]
+
+
+ACCELEROMETER = SampleType(IMU, 3, _acc_values, AccelerometerLog)
+GYROSCOPE = SampleType(IMU, 3, _gyr_values,
+                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, None, frame))
+
+
+@dataclass(frozen=True)
+class FieldConfiguration:
+    """Parameters of the estimator and of all its sensors; ``inputs`` maps topics to SampleType."""
+
+    field: AccelerationFieldParams
+    matching: MatchingParams
+    impact: ImpactParams
+    accelerometers: dict
+    gyroscope: GyroscopeParams | None
+
+    @classmethod
+    def from_mapping(cls, values, source=""):
+        """From ROS parameter names and values, without those of the node itself.
+
+        Raises:
+            ParameterError, LayoutError: with the name of what is wrong.
+        """
+        flat = flatten(values)
+        matching, impact = (
+            c.from_mapping({i.name: flat.pop(i.name) for i in c.infos() if i.name in flat}, source)
+            for c in (MatchingParams, ImpactParams))
+        field, accelerometers, gyroscope = parse_configuration(flat, source)
+        return cls(field, matching, impact, accelerometers, gyroscope)
+
+    @staticmethod
+    def names():
+        """Parameter names, without those of single sensors."""
+        return {info.name for cls in NODE_PARAMETERS for info in cls.infos()}
+
+    @property
+    def inputs(self):
+        inputs = {f"accelerometers/{name}": ACCELEROMETER for name in self.accelerometers}
+        if self.gyroscope is not None:
+            inputs[GYROSCOPE_TOPIC] = GYROSCOPE
+        return inputs
+
+    def make_estimator(self):
+        return AccelerationFieldEstimator(self.field, self.accelerometers, self.gyroscope)
+
+    def make_matcher(self):
+        return SampleMatcher(len(self.inputs), 3, int(round(self.matching.match__tolerance * 1e9)),
+                             int(round(self.matching.match__hold * 1e9)))
+
+    def add(self, estimator, stamp, readings):
+        """Give one row of the matcher to the estimator; return its rows."""
+        count = len(self.accelerometers)
+        gyr = readings[count] if self.gyroscope is not None else None
+        return estimator.add(stamp, readings[:count], gyr)
+
+
+def messages(config, rows):
+    """Yield (topic, stamp, cdr) of rows of the estimator."""
+    gravity, frame = config.field.gravity, config.matching.body_frame
+    points = np.reshape(config.field.points, (-1, 3))
+    bodies = field_at(rows, points, gravity)[1] if len(points) and len(rows) else None
+    for n, row in enumerate(rows):
+        stamp = int(row["stamp"])
+        turn = quat_to_matrix(row["quat"])
+        yield IMU_TOPIC, stamp, imu_message(
+            stamp, frame, row["omega"], row["specific_force"], row["quat"],
+            turn @ row["cov_attitude"] @ turn.T, row["cov_omega"], row["cov_specific_force"])
+        cov = np.zeros((6, 6))
+        cov[:3, :3] = turn.T @ row["cov_acceleration_world"] @ turn
+        cov[3:, 3:] = row["cov_alpha"]
+        yield ACCEL_TOPIC, stamp, ACCEL.encode(stamp, frame, np.concatenate(
+            [turn.T @ row["acceleration_world"], row["alpha"], cov.ravel()]))
+        if bodies is not None:
+            magnitude = np.linalg.norm(bodies[n], axis=1)
+            yield POINTS_TOPIC, stamp, cloud_message(
+                stamp, frame, _FIELDS, np.column_stack([points, bodies[n], magnitude]))
+
+
+class AccelerationFieldStream(Stream):
+    """See :class:`imu_fusion.streams.stream.Stream`; config: FieldConfiguration."""
+
+    def __init__(self, config, emit=None, warn=lambda text: None):
+        self.config = config
+        self.estimator = config.make_estimator()
+        self._index = {topic: k for k, topic in enumerate(config.inputs)}
+        super().__init__(config.inputs, emit, warn)
+
+    def restart(self):
+        self.estimator.reset()
+        self.matcher = self.config.make_matcher()
+        self.saturated = self.missing = 0
+        self.residual_rms = float("nan")
+
+    def take(self, topic, stamp, sample):
+        self._give(self.matcher.add(self._index[topic], stamp, sample))
+
+    def flush(self):
+        self._give(self.matcher.flush())
+        self.smooth()
+
+    def smooth(self):
+        """Emit what mode smoothed has held back; returns the number of samples."""
+        try:
+            rows = self.estimator.finish()
+        except EstimationError as error:
+            self.warn(str(error))
+            return 0
+        self._write(rows)
+        return len(rows)
+
+    def summary(self):
+        """Values for diagnostics."""
+        return {"condition number": f"{self.estimator.condition_number:.3g}",
+                "residual rms in units of noise": f"{self.residual_rms:.3g}",
+                "saturated samples": self.saturated, "samples with a channel missing": self.missing,
+                "late": self.matcher.late, "duplicates": self.matcher.duplicates,
+                "incomplete": self.matcher.incomplete}
+
+    def _give(self, matched):
+        for stamp, readings in matched:
+            self._write(self.config.add(self.estimator, stamp, readings))
+
+    def _write(self, rows):
+        if len(rows):
+            self.residual_rms = float(rows["residual_rms"][-1])
+            self.saturated += int(np.sum(rows["flags"] & SATURATED > 0))
+            self.missing += int(np.sum(rows["flags"] & MISSING > 0))
+            for message in messages(self.config, rows):
+                self.emit(*message)
+
+
+def run(logs, report, config):
+    """The messages that :class:`AccelerationFieldStream` emits for a session, from whole logs.
+
+    The metrics of impacts, where there are any, go into the report's results.
+
+    Args:
+        config: FieldConfiguration.
+        logs: dict of input topic to (log, epochs) of guarded samples; a topic may lack.
+        report: batch.StageReport.
+
+    Yields:
+        (topic, stamp, cdr)
+    """
+    topics = [topic for topic in config.inputs if topic in logs]
+    index = {topic: k for k, topic in enumerate(config.inputs)}
+    impacts = []
+    samples = [logs[topic][0].flat() for topic in topics]
+    epochs = [logs[topic][1] for topic in topics]
+    for epoch in np.unique(np.concatenate(epochs)):
+        keep = [np.flatnonzero(e == epoch) for e in epochs]
+        stamps = [logs[topic][0].stamp[k] for topic, k in zip(topics, keep)]
+        which, number = merge_order(stamps)
+        matcher, estimator = config.make_matcher(), config.make_estimator()
+        matched = []
+        for k, i in zip(which.tolist(), number.tolist()):
+            matched += matcher.add(index[topics[k]], int(stamps[k][i]), samples[k][keep[k][i]])
+        matched += matcher.flush()
+        if not matched:
+            continue
+        readings = np.array([r for _, r in matched])
+        count = len(config.accelerometers)
+        gyr = readings[:, count] if config.gyroscope is not None else None
+        rows = estimator.run(np.array([s for s, _ in matched], dtype=np.int64),
+                             readings[:, :count], gyr)
+        impacts += _impacts(config, rows)
+        yield from messages(config, rows)
+    if impacts:
+        report.results["impacts"] = impacts
+    number = len({impact["stamp"] for impact in impacts})
+    report.summary = f"{number} impacts above {config.impact.impact__trigger:g} m/s^2"
+
+
+def _impacts(config, rows):
+    return measure_impacts(rows, config.field.points, config.field.gravity, config.impact)
+
+
+NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, MatchingParams, ImpactParams)

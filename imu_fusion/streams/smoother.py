@@ -1,0 +1,327 @@
+"""The smoother between its topics: a collection of samples in, a trajectory out.
+
+The node collects while a bag plays or a robot runs; batch reads whole logs. Both
+end in :func:`smooth`, and so in the same messages.
+"""
+
+import json
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import EstimationError, MessageError, SampleError
+from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.recordings.bag import TYPES
+from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
+from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
+                                             diagnostics_value)
+from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
+from imu_fusion.streams.stream import EstimatorNodeParams
+from imu_fusion.parameters.declare import param
+from imu_fusion.samples import checks
+from imu_fusion.samples.guard import Guard, Verdict
+from imu_fusion.surfaces.file import load_surface
+
+IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
+FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
+INPUTS = {topic: SAMPLE_TYPES[layout.msgtype] for topic, layout in (
+    (IMU_TOPIC, IMU), (MAG_TOPIC, MAG), (FIX_TOPIC, FIX), (VELOCITY_TOPIC, TWIST))}
+REQUIRED = (IMU_TOPIC, FIX_TOPIC)
+
+ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
+SMOOTHED_FIX_TOPIC, PATH_TOPIC = "smoother/fix", "smoother/path"
+RESULTS_TOPIC = "smoother/results"
+PATH_TYPE = "nav_msgs/msg/Path"
+OUTPUTS = {ODOMETRY_TOPIC: ODOMETRY.msgtype, SMOOTHED_IMU_TOPIC: IMU.msgtype,
+           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE, RESULTS_TOPIC: DIAGNOSTICS_TYPE}
+PER_SAMPLE = (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, SMOOTHED_FIX_TOPIC)
+
+_NAME = "smoother"
+_SLICE = 1000  # samples whose messages are made at once
+
+
+@dataclass(frozen=True)
+class SmoothingParams(SmootherParams):
+    """The smoother's parameters and what surrounds it."""
+
+    surface: str = param("", path=True, doc="Surface that the body moves on: a name in "
+                         "config/surfaces or the path of a YAML file; empty: none.")
+    path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
+                             doc="Rate of the poses of smoother/path.")
+
+
+@dataclass(frozen=True)
+class SmootherNodeParams(EstimatorNodeParams):
+    """What concerns the node, not the trajectory."""
+
+    memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
+                                doc="Collected samples may take this much; then no more are "
+                                    "taken, and smoothing is refused until smoother/clear. Imu "
+                                    "and magnetometer at 100 Hz take 32 MB an hour; smoothing "
+                                    "takes more (docs/smoother.md).")
+
+
+class Collection:
+    """Samples of the smoother's topics, as they come; guarded, in compact arrays.
+
+    One Imu sample takes 56 bytes, one of the magnetometer 32, one fix 112, one velocity
+    104: 32 MB an hour for Imu and magnetometer at 100 Hz.
+
+    Args:
+        limit: bytes; what comes beyond is counted and dropped.
+        warn: called with a text when something is wrong.
+    """
+
+    def __init__(self, limit, warn=lambda text: None):
+        self.limit = limit
+        self._warn = warn
+        self.clear()
+
+    def clear(self):
+        """Forget everything."""
+        self.dropped = 0
+        self.bad_messages = 0
+        self.bytes = 0
+        self.guards = {topic: Guard() for topic in INPUTS}
+        self._stamps = {topic: array("q") for topic in INPUTS}
+        self._samples = {topic: array("d") for topic in INPUTS}
+        self.frame_ids = {}
+
+    def push(self, topic, cdr):
+        """Take the bytes of one message."""
+        kind, guard = INPUTS[topic], self.guards[topic]
+        try:
+            stamp, frame_id, values = kind.layout.decode(cdr)
+        except MessageError as error:
+            self.bad_messages += 1
+            self._warn(f"{topic}: message left out: {error}")
+            return
+        sample = kind.values(values)
+        epoch = guard.epoch
+        if guard.check(stamp, sample) is not Verdict.OK:
+            return
+        self.frame_ids.setdefault(topic, frame_id)
+        if guard.epoch > epoch:
+            self._warn(f"{topic}: the clock was set back: what was collected before is dropped")
+            self.bytes -= 8 * (1 + kind.width) * len(self._stamps[topic])
+            del self._stamps[topic][:], self._samples[topic][:]
+        size = 8 * (1 + kind.width)
+        if self.bytes + size > self.limit:
+            if not self.dropped:
+                self._warn(f"the collection has reached its limit of {self.limit / 1e6:g} MB: "
+                           "further samples are dropped; see memory_limit and smoother/clear")
+            self.dropped += 1
+            return
+        self.bytes += size
+        self._stamps[topic].append(stamp)
+        self._samples[topic].extend(sample)
+
+    def counts(self):
+        """dict of topic to number of samples held."""
+        return {topic: len(stamps) for topic, stamps in self._stamps.items()}
+
+    def logs(self):
+        """A snapshot: dict of topic to (log, epochs), topics without samples left out.
+
+        Raises:
+            EstimationError: the limit was reached, so that the data have a hole at the end.
+        """
+        if self.dropped:
+            raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
+                                  f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
+                                  "raise memory_limit")
+        logs = {}
+        for topic, kind in INPUTS.items():
+            n = len(self._stamps[topic])
+            if n:
+                stamps = np.array(self._stamps[topic], dtype=np.int64)
+                samples = np.array(self._samples[topic]).reshape(n, kind.width)
+                log = kind.log(stamps, samples, self.frame_ids[topic])
+                logs[topic] = log, np.full(n, self.guards[topic].epoch)
+        return logs
+
+
+def newest_epoch(logs):
+    """The samples since the clock was last set back: dict of topic to log.
+
+    Args:
+        logs: dict of topic to (log, epochs).
+
+    Raises:
+        EstimationError: a topic that is needed has no samples in it.
+    """
+    newest = max((int(epochs[-1]) for _, epochs in logs.values() if len(epochs)), default=0)
+    chosen = {topic: log[epochs == newest] for topic, (log, epochs) in logs.items()}
+    chosen = {topic: log for topic, log in chosen.items() if len(log)}
+    missing = [topic for topic in REQUIRED if topic not in chosen]
+    if missing:
+        raise EstimationError(f"nothing to smooth: no samples on {' and '.join(missing)}"
+                              + (" since the clock was set back" if newest else ""))
+    return chosen
+
+
+def smooth(params, logs):
+    """Smooth collected samples.
+
+    Args:
+        params: SmoothingParams.
+        logs: dict of topic to (log, epochs).
+
+    Returns:
+        SmootherResult
+
+    Raises:
+        ImuFusionError: with the reason, if there is no meaningful result.
+    """
+    chosen = newest_epoch(logs)
+    surface = load_surface(params.surface) if params.surface else None
+    return Smoother(params, surface).run(chosen[IMU_TOPIC], chosen.get(MAG_TOPIC),
+                                         chosen[FIX_TOPIC], chosen.get(VELOCITY_TOPIC))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a result says in words and plain numbers: ``summary`` one line, ``numbers`` for JSON,
+    ``remarks`` (texts) among them; ``frame`` LocalFrame and ``frame_id`` of the sensor."""
+
+    summary: str
+    numbers: dict
+    frame: object
+    frame_id: str
+
+    @classmethod
+    def of(cls, result, frame_id):
+        """Of a SmootherResult."""
+        numbers = {"samples": len(result.samples), "iterations": result.iterations,
+                   "converged": result.converged, "cost": float(result.cost[-1]),
+                   "misfit": result.misfit()}
+        if result.jump is not None:
+            numbers["jump"] = result.jump.to_mapping()
+        numbers["remarks"] = result.remarks()
+        return cls(result.summary(), numbers, result.frame, frame_id)
+
+    @property
+    def remarks(self):
+        """Texts on what makes the result doubtful."""
+        return self.numbers["remarks"]
+
+    def message(self, stamp):
+        """CDR bytes of the diagnostic_msgs/DiagnosticArray on smoother/results; values are JSON."""
+        return diagnostics_message(
+            stamp, "world", _NAME, self.summary,
+            {key: json.dumps(value) for key, value in self.numbers.items()},
+            bool(self.remarks), self.frame_id)
+
+
+def results_value(cdr):
+    """The numbers (dict) of an Outcome in a message of smoother/results.
+
+    Raises:
+        MessageError: the bytes are no such message.
+    """
+    values = diagnostics_value(cdr, _NAME)[1]
+    try:
+        return {key: json.loads(value) for key, value in values.items()}
+    except ValueError as error:
+        raise MessageError(f"{RESULTS_TOPIC}: a value cannot be read as JSON ({error})") from None
+
+
+def messages(samples, outcome, path_rate):
+    """Yield (topic, stamp, cdr) of a SmootherResult, in order of stamps, the path and the results
+    last.
+
+    Odometry is in ``world`` (east-north-up at the result's frame) with the twist in the
+    sensor's axes; its orientation covariance is about the fixed axes of the world.
+
+    Args:
+        samples: structured array of a SmootherResult. outcome: Outcome. path_rate: Hz.
+    """
+    frame_id = outcome.frame_id
+    for first in range(0, len(samples), _SLICE):
+        rows = samples[first:first + _SLICE]
+        for stamp, odometry, imu, fix in zip(rows["stamp"], *_values(rows, outcome.frame)):
+            stamp = int(stamp)
+            yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", odometry, frame_id)
+            yield SMOOTHED_IMU_TOPIC, stamp, IMU.encode(stamp, frame_id, imu)
+            yield SMOOTHED_FIX_TOPIC, stamp, fix_message(stamp, frame_id, *fix[:3], fix[3:])
+    if len(samples):
+        last = int(samples["stamp"][-1])
+        yield PATH_TOPIC, last, _path(samples, path_rate)
+        yield RESULTS_TOPIC, last, outcome.message(last)
+
+
+def _values(rows, frame):
+    """Values of the messages of samples: Odometry and Imu in the order of their layouts, latitude,
+    longitude, height and covariance; (n, size) each."""
+    n = len(rows)
+    rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    back = rotation.transpose(0, 2, 1)
+    vel_imu = np.einsum("nij,nj->ni", back, rows["vel_world"])
+    cov_attitude = rotation @ rows["cov_attitude"] @ back
+    # A wrong attitude turns the velocity, too; how the two errors go together is not kept.
+    turned = np.cross(np.eye(3), vel_imu[:, None, :])
+    pose, twist, imu = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, IMU.size))
+    pose[:, :3, :3], pose[:, 3:, 3:] = rows["cov_position"], cov_attitude
+    twist[:, :3, :3] = (back @ rows["cov_velocity"] @ rotation
+                        + turned @ rows["cov_attitude"] @ turned.transpose(0, 2, 1))
+    axes = np.arange(3)
+    twist[:, axes + 3, axes + 3] = rows["gyr_sd"] ** 2
+    odometry = np.zeros((n, ODOMETRY.size))
+    for field, value in (("position", rows["position_world"]),
+                         ("orientation", rows["quat_world_imu"]), ("linear", vel_imu),
+                         ("pose_covariance", pose.reshape(n, 36)), ("angular", rows["gyr"]),
+                         ("twist_covariance", twist.reshape(n, 36))):
+        odometry[:, ODOMETRY[field]] = value
+    for field, value in (("orientation", rows["quat_world_imu"]),
+                         ("orientation_covariance", cov_attitude.reshape(n, 9)),
+                         ("angular_velocity", rows["gyr"]), ("linear_acceleration", rows["acc"])):
+        imu[:, IMU[field]] = value
+    for field, name in (("angular_velocity_covariance", "gyr_sd"),
+                        ("linear_acceleration_covariance", "acc_sd")):
+        imu[:, IMU[field]][:, ::4] = rows[name] ** 2
+    place = np.column_stack(frame.to_geodetic(rows["position_world"]))
+    return odometry, imu, np.column_stack([place, rows["cov_position"].reshape(n, 9)])
+
+
+def _path(samples, rate):
+    """CDR bytes of a nav_msgs/Path with poses at least 1 / rate apart."""
+    types = TYPES.types
+    header_type, time_type = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+
+    def header(stamp):
+        sec, nanosec = divmod(int(stamp), NANOSECONDS)
+        return header_type(stamp=time_type(sec=sec, nanosec=nanosec), frame_id="world")
+
+    slots = (samples["stamp"] - samples["stamp"][0]) // round(1e9 / rate)
+    first = np.flatnonzero(np.diff(slots, prepend=-1))
+    poses = []
+    for row in samples[first]:
+        pose = types["geometry_msgs/msg/Pose"](
+            position=types["geometry_msgs/msg/Point"](*map(float, row["position_world"])),
+            orientation=types["geometry_msgs/msg/Quaternion"](*map(float, row["quat_world_imu"])))
+        poses.append(types["geometry_msgs/msg/PoseStamped"](header=header(row["stamp"]), pose=pose))
+    path = types[PATH_TYPE](header=header(samples["stamp"][-1]), poses=poses)
+    return bytes(TYPES.serialize_cdr(path, PATH_TYPE))
+
+
+def findings(logs):
+    """What looks wrong with whole logs as recorded: texts."""
+    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC) + checks.check_fix(logs[FIX_TOPIC])
+    if MAG_TOPIC in logs:
+        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
+    return [finding.text for finding in found]
+
+
+def run(logs, report, params):
+    """Batch: the messages that the node publishes after smoothing the same samples."""
+    try:
+        result = smooth(params, logs)
+    except (EstimationError, SampleError) as error:
+        report.skipped = str(error)
+        return
+    outcome = Outcome.of(result, logs[IMU_TOPIC][0].frame_id)
+    report.summary, report.results = outcome.summary, outcome.numbers
+    report.remarks = outcome.remarks
+    yield from messages(result.samples, outcome, params.path_rate)

@@ -1,0 +1,164 @@
+"""The smoother and its surface: heights, windows, grids, and surfaces that do not fit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from benchmarks.jumps import moved
+from imu_fusion.errors import EstimationError, ParameterError
+from imu_fusion.estimation.smoother.events import JumpEvents
+from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.result import SAMPLE
+from imu_fusion.estimation.smoother.surface_fit import surface_fits
+from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, record
+from imu_fusion.simulation.ski_jump import FASTEST_WOBBLE
+from imu_fusion.surfaces.file import load_surface, surface_from_mapping
+from imu_fusion.surfaces.constraint import Surface, height_constraint
+
+
+def test_unknown_height_of_the_sensor(jump):
+    low = LocalFrame(jump.hill.origin.latitude_deg, jump.hill.origin.longitude_deg,
+                     jump.hill.origin.height - 1.0)
+    believed = dataclasses.replace(jump.hill, origin=low)
+    # With the GNSS of a survey the height shows; with a logger's it stays uncertain.
+    sharp = GnssErrors(position_sd=(0.05, 0.05, 0.1))
+    rec = record(jump, np.random.default_rng(9), gnss=sharp)
+    r = Smoother(SmootherParams(body_height_sd=2.0), believed).run(
+        rec.imu, rec.mag, rec.fix, rec.velocity)
+    height, sd = (v[0, 0] for v in r.states["body_height"])
+    assert abs(height - 1.0) < max(4 * sd, 0.05) and sd < 0.1
+
+
+def test_a_surface_that_does_not_fit_says_so(jump, recording, result):
+    assert result.remarks() == []
+    # The sensor moves as sigma allows, and the trajectory follows it in part.
+    assert all(0.1 < fit.excess < 1.2 for fit in result.surface.values())
+    assert set(result.surface) == {"in_run", "in_run_lateral", "landing"}
+    logs = recording.imu, recording.mag, recording.fix, recording.velocity
+
+    neighbour = Smoother(SmootherParams(), load_surface("oberstdorf_hs137")).run(*logs)
+    assert neighbour.surface["in_run"].excess > 3.0
+    assert any("stands off the surface (in_run) by" in text for text in neighbour.remarks())
+
+    shifted = moved(jump.hill, north=5.0)
+    beside = Smoother(SmootherParams(), shifted).run(*logs)
+    # The surface holds the trajectory too far north; fixes have a standard deviation of 3 m.
+    (text,) = [text for text in beside.remarks() if "the fixes lie beside" in text]
+    north = float(text.split("by ")[1].split("/")[1])
+    assert -5.0 / 3.0 < north < -0.5
+    # Fixes that may wander by that much do not lie beside.
+    wander = SmootherParams(gnss_position_error_sd=(5.0, 5.0, 5.0), gnss_position_error_tau=300.0)
+    assert Smoother(wander, shifted).run(*logs).remarks() == []
+
+
+def test_a_surface_says_as_much_per_second_at_any_rate(jump):
+    said = []
+    for rate in (50, 100, 400):
+        stamp = EPOCH + np.arange(10 * rate + 1) * (10**9 // rate)
+        place = jump.at((stamp - EPOCH) * 1e-9).position_world
+        events = JumpEvents(EPOCH + int(20e9), EPOCH + int(25e9))
+        start, _, gradient, sigma, _ = evaluate_constraints(
+            jump.hill.constraints(), place, stamp, events, SmootherParams())
+        assert start[-1] == 2 * len(stamp)  # height and lateral, in-run only
+        said.append(np.sum(1.0 / sigma ** 2))
+        if rate == 100:
+            assert np.allclose(sigma, 0.1, rtol=1e-12)  # as the paper has it
+    # A simulated sensor moves against the skis with the density of these rows.
+    allowed = 0.1 * np.sqrt(2.0 * SmootherParams().surface_interval * FASTEST_WOBBLE)
+    assert abs(jump.params.wobble / allowed - 1) < 0.02
+    # Two rows for 10 s of independent 0.1 m every 0.01 s, and half an interval at the ends.
+    assert np.allclose(said, 2 * 10 / 0.01 / 0.1 ** 2, rtol=0.003)
+
+
+@pytest.mark.parametrize("rate", [50, 200])
+def test_deviations_over_seconds_are_told_by_what_sigma_allows(rate):
+    plane = surface_from_mapping({"type": "plane", "slope_deg": 0, "aspect_deg": 0, "sigma": 0.1,
+                                  "origin": {"latitude": 47, "longitude": 10, "height": 500}})
+    samples = np.zeros(60 * rate, SAMPLE)
+    samples["stamp"] = EPOCH + np.arange(60 * rate) * (10**9 // rate)
+    samples["stamp"][20 * rate:] += 3600 * 10**9  # an hour without samples counts for nothing
+    # Rows of 0.1 m every 10 ms give the mean of a second 10 mm; beside that, 100 Hz of noise that
+    # means over a second do not see.
+    samples["position_world"][:, 2] = 0.015 + 0.02 * (-1.0) ** np.arange(60 * rate)
+    fit = surface_fits(plane.constraints(), samples, {}, None, SmootherParams())["plane"]
+    # Half an interval at both ends of each part.
+    assert abs(fit.excess - 1.5) < 0.02
+    assert abs(fit.rms - 0.025) < 1e-9 and abs(fit.largest - 0.035) < 1e-9
+    lifted = surface_fits(plane.constraints(), samples, {}, None,
+                          SmootherParams(body_height=0.015))["plane"]
+    assert lifted.excess < 0.05  # samples beside the gap count up to fivefold
+    slow = SmootherParams(surface_interval=0.04)  # twice as far for twice the deviation
+    assert abs(surface_fits(plane.constraints(), samples, {}, None, slow)["plane"].excess
+               - 0.75) < 0.02
+
+
+def test_a_plane_holds_the_height(jump, recording):
+    t = (recording.imu.stamp - EPOCH) * 1e-9
+    still = recording.imu[t < jump.t_start]
+    origin = jump.hill.origin.to_geodetic(recording.motion.position_world[0])
+    plane = surface_from_mapping({"type": "plane", "slope_deg": 0, "aspect_deg": 0, "sigma": 0.1,
+                                  "origin": dict(zip(("latitude", "longitude", "height"),
+                                                     map(float, origin)))})
+    r = Smoother(SmootherParams(), plane).run(still, recording.mag, recording.fix,
+                                              recording.velocity)
+    assert np.abs(r.samples["position_world"][:, 2]).max() < 0.1
+    assert r.samples["cov_position"][:, 2, 2].max() < 0.01 < r.samples["cov_position"][0, 0, 0]
+
+
+def test_a_surface_holds_within_its_windows(jump, recording):
+    # A plane where the jumper sits: true in the first five seconds, far off later.
+    origin = jump.hill.origin
+    level = surface_from_mapping({
+        "type": "plane", "slope_deg": 0.0, "aspect_deg": 0.0, "sigma": 0.01,
+        "origin": {"latitude": origin.latitude_deg, "longitude": origin.longitude_deg,
+                   "height": origin.height + float(recording.motion.position_world[0, 2])}})
+    windows = SmootherParams(surface_windows=(1.0, 4.0, 4.5, 5.0))
+    r = Smoother(windows, level).run(recording.imu, recording.mag, recording.fix,
+                                     recording.velocity)
+    (fit,) = r.surface.values()
+    t = (r.samples["stamp"][fit.sample] - EPOCH) * 1e-9
+    assert np.array_equal(np.unique(t.round(2)), np.r_[np.arange(100, 400), np.arange(450, 500)]
+                          / 100)
+    assert fit.silent == 0.0 and fit.largest < 0.05
+    assert r.remarks() == []
+    sd = np.sqrt(r.samples["cov_position"][:, 2, 2])
+    assert sd[200] < 0.02 < 0.1 < sd[2000]
+    # Without windows the plane is held against 80 m of descent, and this is said.
+    whole = Smoother(SmootherParams(), level).run(recording.imu, recording.mag, recording.fix,
+                                                  recording.velocity)
+    assert any("stands off the surface" in text for text in whole.remarks())
+    with pytest.raises(EstimationError, match="says nothing at any sample.*surface_windows"):
+        Smoother(SmootherParams(surface_windows=(50.0, 60.0)), level).run(
+            recording.imu, recording.mag, recording.fix, recording.velocity)
+    for wrong in ((1.0,), (4.0, 1.0), (1.0, 3.0, 2.0, 4.0)):
+        with pytest.raises(ParameterError, match="pairs of start and stop"):
+            SmootherParams(surface_windows=wrong)
+
+
+def test_a_grid_that_ends_says_so(jump, recording):
+    # Known in the half of the in-run only.
+    def elevation(east, north):
+        x = jump.hill.to_hill(np.stack([east, north, 0.0 * east], axis=1))[:, 0]
+        z, slope, _ = jump.hill.in_run(np.minimum(x, 0.0))
+        z = np.where(x < -40.0, -z, np.nan)
+        return (z, *(-slope[:, None] * jump.hill.axes[0, :2]).T)
+
+    class Grid(Surface):
+        def constraints(self):
+            return (height_constraint("grid", "always", 0.1, elevation),)
+
+    r = Smoother(SmootherParams(), Grid(jump.hill.origin)).run(
+        recording.imu, recording.mag, recording.fix, recording.velocity)
+    known = (jump.hill.to_hill(recording.motion.position_world)[:, 0] < -40.0).mean()
+    assert abs(r.surface["grid"].silent - (1.0 - known)) < 0.01
+    assert any("says nothing at 6" in text for text in r.remarks()), (known, r.remarks())
+
+
+def test_a_surface_elsewhere_is_refused(jump, recording):
+    away = dataclasses.replace(jump.hill, origin=LocalFrame(48.4, 10.2922, 900.0))
+    with pytest.raises(EstimationError, match="origin is 1[0-9][0-9] km from the first fix"):
+        Smoother(SmootherParams(), away).run(recording.imu, recording.mag, recording.fix,
+                                             recording.velocity)
