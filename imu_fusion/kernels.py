@@ -124,8 +124,8 @@ class _KernelCache(_Cache):
 
 def _directory(file: Path) -> Path | None:
     """Where the compiled functions of a file are, None if nowhere."""
-    if not file.exists():
-        return None
+    if not (file.exists() and file.is_relative_to(_PACKAGE)):
+        return None    # typed in, or somebody else's
     sources = b"".join(str(f.relative_to(_PACKAGE.parent)).encode() + _digest(f)
                        for f in sorted(sources_of(file)))
     versions = f"{numba.__version__} {sys.version} ".encode()

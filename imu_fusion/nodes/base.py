@@ -15,9 +15,10 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from imu_fusion.parameters import file as parameter_file
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
 from imu_fusion.nodes.flow import steady_timer
+from imu_fusion.parameters import file as parameter_file
+from imu_fusion.parameters.declare import unknown_parameter
 
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
@@ -131,8 +132,8 @@ class Node(rclpy.node.Node):
             self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
         unknown = sorted(given.keys() - known.keys())
         if unknown:
-            raise ParameterError(f"unknown parameter '{unknown[0]}' of node {self.get_name()}; "
-                                 f"known: {', '.join(sorted(known))}")
+            raise ParameterError(f"{unknown_parameter(unknown[0], self.PARAMETERS)} "
+                                 f"(from node {self.get_name()})")
         parameter_file.resolve_paths(given, self.PARAMETERS, self.get_name(), params_files)
         values = {}
         for cls in self.PARAMETERS:
@@ -145,7 +146,7 @@ class Node(rclpy.node.Node):
                     own[info.name] = value
             values[cls] = cls.from_mapping(own, source=f"node {self.get_name()}")
             for info in cls.infos():
-                value = getattr(values[cls], info.name.replace(".", "__"))
+                value = values[cls].get(info.name)
                 # rclpy cannot tell the type of an empty list: declared as not set.
                 unset = value is None or value == ()
                 self.declare_parameter(
@@ -161,7 +162,7 @@ class Node(rclpy.node.Node):
                 if any(info.name == parameter.name for info in cls.infos()):
                     try:
                         changed[cls] = changed[cls].replace(
-                            **{parameter.name.replace(".", "__"): parameter.value})
+                            **{parameter.name: parameter.value})
                     except ParameterError as error:
                         return SetParametersResult(successful=False, reason=str(error))
         try:

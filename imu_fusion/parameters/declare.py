@@ -1,15 +1,21 @@
-"""Parameters of estimators and nodes: declared once, as a frozen dataclass.
+"""Parameters of estimators and nodes: declared once, as frozen dataclasses.
 
 Name, default, unit, bounds and meaning live in the dataclass field. ROS
-parameter declarations, YAML parsing, command line help and the tables of the
-README are all derived from it.
+parameter declarations, YAML parsing, command line help, the tables of the docs and the records
+that compiled kernels read (:mod:`imu_fusion.parameters.record`) are all derived from it.
+
+    @dataclass(frozen=True)
+    class Sensor(Parameters):
+        gyro_noise_density: float = param(1e-3, unit="rad/s/sqrt(Hz)", low=0, doc="...")
 
     @dataclass(frozen=True)
     class OrientationParams(Parameters):
-        gyro_noise_density: float = param(1e-3, unit="rad/s/sqrt(Hz)", low=0, doc="...")
+        method: str = param("fusion", choices=("fusion", "gyro_mag"), doc="...")
+        sensor: Sensor = Sensor()
 
-A field whose type allows ``None`` is *unset* by default: the estimator finds
-the value itself.
+A field that holds Parameters is a group: its parameters are ``sensor.gyro_noise_density`` in
+ROS, YAML and messages, ``params.sensor.gyro_noise_density`` in Python. A field whose type allows
+``None`` is *unset* by default: the estimator finds the value itself.
 """
 
 import dataclasses
@@ -17,6 +23,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
+from typing import ClassVar
 
 from imu_fusion.errors import ParameterError
 
@@ -128,7 +135,7 @@ class ParameterInfo:
         return number
 
 
-def _split_type(annotation):
+def split_type(annotation):
     """(element type, is tuple, optional) of a field's annotation."""
     optional = False
     if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
@@ -144,25 +151,44 @@ def _split_type(annotation):
 class Parameters:
     """Base of all parameter dataclasses; validates every field when made.
 
-    In ROS names a double underscore of the field stands for a dot:
-    ``initial__mode`` is the parameter ``initial.mode``.
+    ``OLD_NAMES`` maps dotted names of earlier versions to what they are called now.
     """
 
+    OLD_NAMES: ClassVar[Mapping[str, str]] = {}
+
     def __post_init__(self):
-        for info in self.infos():
-            field = info.name.replace(".", "__")
-            object.__setattr__(self, field, info.check(getattr(self, field)))
+        for field, kind in fields_of(type(self)):
+            if not is_group(kind):
+                object.__setattr__(self, field.name,
+                                   _info(field, kind).check(getattr(self, field.name)))
+        idle = self.idle()
+        defaults = {info.name: info for info in self.infos()} if idle else {}
+        for name, info in defaults.items():
+            why = next((why for key, why in idle.items()
+                        if name == key or (key.endswith(".") and name.startswith(key))), None)
+            if why is not None and self.get(name) != info.default:
+                raise ParameterError(f"parameter '{name}': does nothing {why}; leave it out")
+
+    def idle(self):
+        """Parameters that do nothing under the values chosen: dict of dotted name (or of the prefix
+        of a group, ending in a dot) to the reason, as in "with method 'gyro_mag'". Set to
+        anything but their default, they are refused."""
+        return {}
 
     @classmethod
     def infos(cls):
-        """A list of ParameterInfo, in order of declaration."""
-        hints = typing.get_type_hints(cls)
+        """A list of ParameterInfo, in order of declaration, with dotted names."""
         result = []
-        for field in dataclasses.fields(cls):
-            element, is_tuple, optional = _split_type(hints[field.name])
-            result.append(ParameterInfo(
-                name=field.name.replace("__", "."), kind=hints[field.name], element=element,
-                is_tuple=is_tuple, optional=optional, default=field.default, **field.metadata))
+        for field, kind in fields_of(cls):
+            if is_group(kind):
+                # The group's defaults are those of the instance that the field holds.
+                default = (None if field.default is dataclasses.MISSING else field.default)
+                for info in kind.infos():
+                    if default is not None:
+                        info = dataclasses.replace(info, default=default.get(info.name))
+                    result.append(dataclasses.replace(info, name=f"{field.name}.{info.name}"))
+            else:
+                result.append(_info(field, kind))
         return result
 
     @classmethod
@@ -175,35 +201,98 @@ class Parameters:
             ignore: names (or prefixes ending in a dot) that belong to somebody else.
 
         Raises:
-            ParameterError: unknown or missing name, wrong type, value out of bounds.
+            ParameterError: unknown or missing name, wrong type, value out of bounds, or a
+                parameter that does nothing.
         """
         flat = flatten(values)
         known = {info.name: info for info in cls.infos()}
+        where = f" (from {source})" if source else ""
         accepted = {}
         for name, value in flat.items():
             if name in known:
-                accepted[name.replace(".", "__")] = known[name].check(value, source)
+                accepted[name] = known[name].check(value, source)
             elif not any(name == i or (i.endswith(".") and name.startswith(i)) for i in ignore):
-                raise ParameterError(
-                    f"unknown parameter '{name}'" + (f" (from {source})" if source else "")
-                    + "; known: " + ", ".join(sorted(known)))
+                raise ParameterError(unknown_parameter(name, [cls]) + where)
         missing = [name for name, info in known.items()
                    if info.default is dataclasses.MISSING and name not in flat]
         if missing:
-            raise ParameterError(f"missing parameters: {', '.join(missing)}"
-                                 + (f" (from {source})" if source else ""))
-        return cls(**accepted)
+            raise ParameterError(f"missing parameters: {', '.join(missing)}{where}")
+        try:
+            return cls._made(accepted)
+        except ParameterError as error:
+            raise ParameterError(f"{error}{where}") from None
+
+    @classmethod
+    def _made(cls, flat):
+        """From dotted names, of which the missing ones keep their defaults."""
+        own = {}
+        for field, kind in fields_of(cls):
+            if is_group(kind):
+                inner = {name.partition(".")[2]: value for name, value in flat.items()
+                         if name.startswith(field.name + ".")}
+                if field.default is dataclasses.MISSING:
+                    own[field.name] = kind._made(inner)
+                elif inner:
+                    own[field.name] = field.default.replace(**inner)
+            elif field.name.replace("__", ".") in flat:
+                own[field.name] = flat[field.name.replace("__", ".")]
+        return cls(**own)
+
+    def get(self, name):
+        """The value of a dotted name."""
+        if hasattr(self, name.replace(".", "__")):
+            return getattr(self, name.replace(".", "__"))
+        value = self
+        for part in name.split("."):
+            value = getattr(value, part)
+        return value
 
     def to_mapping(self):
         """Dotted names and values, without what is unset."""
-        pairs = ((info.name, getattr(self, info.name.replace(".", "__")))
-                 for info in self.infos())
+        pairs = ((info.name, self.get(info.name)) for info in self.infos())
         return {name: list(value) if isinstance(value, tuple) else value
                 for name, value in pairs if value is not None}
 
     def replace(self, **changes):
-        """A validated copy with changes."""
-        return dataclasses.replace(self, **changes)
+        """A validated copy with changes; names may be dotted: ``replace(**{"sensor.x": 1})``."""
+        own, inner = {}, {}
+        for name, value in changes.items():
+            if hasattr(self, name.replace(".", "__")):
+                name = name.replace(".", "__")
+            first, dot, rest = name.partition(".")
+            if dot:
+                inner.setdefault(first, {})[rest] = value
+            else:
+                own[first] = value
+        for name, values in inner.items():
+            own[name] = own.get(name, getattr(self, name)).replace(**values)
+        return dataclasses.replace(self, **own)
+
+
+def fields_of(cls):
+    """(dataclass field, its annotation) of each field, in order."""
+    hints = typing.get_type_hints(cls)
+    return [(field, hints[field.name]) for field in dataclasses.fields(cls)]
+
+
+def is_group(kind):
+    """Whether an annotation is that of a group of parameters."""
+    return isinstance(kind, type) and issubclass(kind, Parameters)
+
+
+def _info(field, kind):
+    element, is_tuple, optional = split_type(kind)
+    return ParameterInfo(name=field.name.replace("__", "."), kind=kind, element=element, is_tuple=is_tuple,
+                         optional=optional, default=field.default, **field.metadata)
+
+
+def unknown_parameter(name, classes):
+    """What to say of a name that none of the Parameters ``classes`` has."""
+    for cls in classes:
+        if name in cls.OLD_NAMES:
+            return f"parameter '{name}' is called '{cls.OLD_NAMES[name]}' now"
+    known = sorted(info.name for cls in classes for info in cls.infos())
+    return f"unknown parameter '{name}'; known: {', '.join(known)}"
 
 
 def flatten(values, prefix=""):

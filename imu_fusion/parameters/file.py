@@ -5,7 +5,7 @@ from pathlib import Path
 import yaml
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.parameters.declare import flatten
+from imu_fusion.parameters.declare import flatten, unknown_parameter
 
 
 def load(path):
@@ -66,7 +66,12 @@ def parameters_for(classes, node, path=None, ignore=()):
     if path is None:
         return [cls() for cls in classes]
     known = {info.name for cls in classes for info in cls.infos()}
-    values = node_values(node, path, known)
+    old = {name for cls in classes for name in cls.OLD_NAMES}
+    values = node_values(node, path, known | old)
+    for name in values:
+        if name not in known and not any(
+                name == i or (i.endswith(".") and name.startswith(i)) for i in ignore):
+            raise ParameterError(f"{unknown_parameter(name, classes)} (from {path})")
     resolve_paths(values, classes, node, [path])
     result = []
     for cls in classes:
