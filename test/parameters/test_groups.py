@@ -50,11 +50,12 @@ def test_nested_and_dotted_names_are_the_same():
     ({"gyro_range": 1.0}, "'gyro_range' is called 'sensor.gyro_range' now"),
     ({"method": "slow", "steps": 5}, "'steps': does nothing with method 'slow'; leave it out"),
     ({"sensor.gyro_noise": 1.0}, "unknown parameter 'sensor.gyro_noise'; known: .*sensor.gyro_ran"),
-    ({"sensor": {"gyro_range": [0.0]}}, "'sensor.gyro_range'.*0.0 is out of bounds"),
+    ({"sensor": {"gyro_range": [0.0]}}, r"'sensor.gyro_range'.*\[0.0\] is out of bounds"),
 ])
 def test_wrong_names_are_refused_with_the_remedy(values, text):
-    with pytest.raises(ParameterError, match=text + r".*\(from some.yaml\)|" + text):
+    with pytest.raises(ParameterError, match=text) as error:
         Example.from_mapping(values, "some.yaml")
+    assert "(from some.yaml)" in str(error.value)
 
 
 def test_a_default_that_does_nothing_may_be_given():
