@@ -29,6 +29,8 @@ class _Group(click.Group):
         except ImuFusionError as error:
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
+        except KeyboardInterrupt:
+            ctx.exit(130)
         except ModuleNotFoundError as error:
             extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
             if extra is None:
@@ -285,6 +287,13 @@ def demo(name, out):
     """
     from imu_fusion.demos import demo as demos
     demos.run(name, out, console)
+
+
+@cli.command()
+def compile():
+    """Compile the kernels for this machine now, so that no node does when it starts."""
+    from imu_fusion.compile_ahead import compile_ahead
+    compile_ahead(lambda text: click.echo(text, err=True))
 
 
 def main():
