@@ -32,7 +32,7 @@ setup(
     maintainer="imu_fusion maintainers",
     maintainer_email="maintainers@imu-fusion.example.org",
     license="Apache-2.0",
-    python_requires=">=3.10",
+    python_requires=">=3.11",
     packages=find_packages(include=["imu_fusion", "imu_fusion.*"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),

@@ -42,7 +42,7 @@ def njit(function: Callable) -> Callable:
     dispatcher = numba.njit(fastmath=False)(function)
     directory = _directory(Path(function.__code__.co_filename))
     if directory is not None:
-        dispatcher._cache = _KernelCache(function, directory)
+        dispatcher._cache = _KernelCache(function, directory)  # type: ignore[attr-defined]
     return dispatcher
 
 
