@@ -16,7 +16,8 @@ from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_mes
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
 from imu_fusion.messages.orientation_status import (FLAGS_TYPE, bias_message, flags_message,
                                                     lasting_flags)
-from imu_fusion.streams.stream import Stream
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import EstimatorNodeParams, Stream
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import MagLog, checks
 from imu_fusion.sensors.magnetometer_calibration import MagCalibrator
@@ -282,7 +283,7 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def run(logs, report, params, output):
+def process_logs(logs, report, params, output):
     """The messages that :class:`OrientationStream` emits for a session, from whole logs.
 
     Args:
@@ -336,3 +337,7 @@ def _first_north(params, fix, mask):
         if turn is not None:
             return stamp, turn
     return None, 0.0
+
+
+STAGE = Stage("orientation_estimator", (OrientationParams, OrientationOutputParams),
+              (EstimatorNodeParams,), INPUTS, (IMU_TOPIC,), OUTPUTS, process_logs, findings)
