@@ -17,7 +17,7 @@ report = ["plotly>=5.15"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
-test = ["pytest>=7.4", "pytest-xdist>=3.5", "hypothesis>=6", "colcon-common-extensions", *report,
+test = ["ruff>=0.6", "mypy>=1.10", "types-PyYAML", "pytest>=7.4", "pytest-xdist>=3.5", "hypothesis>=6", "colcon-common-extensions", *report,
         *terrain]
 
 nodes = ["replayer", "recorder", "orientation_estimator", "smoother",

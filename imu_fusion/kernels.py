@@ -231,4 +231,3 @@ def _read(file: Path) -> bytes:
 @cache
 def _digest(file: Path) -> bytes:
     return hashlib.sha256(_read(file)).digest()
-

@@ -257,7 +257,7 @@ class Parameters:
                 for name, value in pairs if value is not None}
 
     def replace(self, **changes: Any) -> Self:
-        """A validated copy with changes; names may be dotted: ``replace(**{"sensor.x": 1})``."""
+        """A validated copy with changes, by field or by dotted name."""
         own: dict[str, Any] = {}
         inner: dict[str, dict[str, Any]] = {}
         for name, value in changes.items():
@@ -286,8 +286,8 @@ def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
 
 def _info(field: dataclasses.Field, kind: Any) -> ParameterInfo:
     element, is_tuple, optional = split_type(kind)
-    return ParameterInfo(name=field.name.replace("__", "."), kind=kind, element=element, is_tuple=is_tuple,
-                         optional=optional, default=field.default, **field.metadata)
+    return ParameterInfo(name=field.name.replace("__", "."), kind=kind, element=element,
+                         is_tuple=is_tuple, optional=optional, default=field.default, **field.metadata)
 
 
 def unknown_parameter(name: str, classes: Iterable[type[Parameters]]) -> str:
