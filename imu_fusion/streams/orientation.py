@@ -100,7 +100,7 @@ class _Writer:
                 self._next_bias = stamp + _BIAS_INTERVAL
                 yield BIAS_TOPIC, stamp, bias_message(row, frame_id)
         if len(rows):
-            east = quat_rotate(row["quat_world_imu"], np.array([1.0, 0.0, 0.0]))
+            east = quat_rotate(row["quat_world_imu"], (1.0, 0.0, 0.0))
             self.yaw = math.atan2(self._up * east[1], east[0])
 
     def corrected(self, rows, frame_id):
@@ -126,10 +126,10 @@ class _Writer:
 
     def _changed(self, row, has_force):
         row = row.copy()
-        turn = quat_exp(np.array([0.0, 0.0, self._up * self.turn]))
+        turn = quat_exp((0.0, 0.0, self._up * self.turn))
         row["quat_world_imu"] = quat_multiply(turn, row["quat_world_imu"])
         if self._output.remove_gravity_vector and has_force:
-            up = np.array([0.0, 0.0, self._up * self._output.gravity])
+            up = (0.0, 0.0, self._up * self._output.gravity)
             row["acc"] -= quat_rotate_inverse(row["quat_world_imu"], up)
         return row
 
