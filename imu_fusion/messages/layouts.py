@@ -19,7 +19,7 @@ NANOSECONDS = 1_000_000_000
 _LITTLE = b"\x00\x01\x00\x00"
 
 
-_FEW = 4              # messages that are decoded or encoded faster one by one
+_FEW = 8              # messages that are decoded or encoded faster one by one
 _FRAMES_AT_ONCE = 8   # different frame ids of one length that are looked for
 
 
