@@ -123,8 +123,8 @@ def field_configuration(params_file):
 
 def _configure_smoother(stage, params_file):
     params = stage.read_params(params_file)
-    if params[0].surface:
-        load_surface(params[0].surface)  # a bad file is refused before anything is read
+    if params[0].surface.file:
+        load_surface(params[0].surface.file)  # a bad file is refused before anything is read
     return stage, params
 
 
