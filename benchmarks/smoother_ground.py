@@ -11,8 +11,8 @@ from benchmarks.jumps import write
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.estimation.smoother.params import Gnss
-from imu_fusion.recordings.bag import open_bag
-from imu_fusion.messages.convert import read_log
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.streams.smoother import SurfaceFile
 from imu_fusion.surfaces.file import load_surface
 

@@ -130,13 +130,15 @@ class Problem:
         return surface_points(self.x[:, 0:3], self.x[:, 6:10], self._surface_lever())
 
     def _constraint_rows(self, events):
-        start, residual, gradient, *others = evaluate_constraints(
+        start, residual, gradient, sigma, height = evaluate_constraints(
             self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params)
         state, lever = self.layout[model.SURFACE_ARM] >= 0, self._surface_lever()
         if state or np.any(lever):
             turned, along = lever_gradient(start, gradient, self.x[:, 6:10], lever)
             gradient = np.hstack([gradient, turned, along] if state else [gradient, turned])
-        return start, residual, gradient, *others
+        if self.layout[model.BODY_HEIGHT] < 0:
+            residual = residual - np.where(height, self.params.surface.body_height, 0.0)
+        return start, residual, gradient, sigma, height
 
     def step(self, events, with_cov=False):
         """One Gauss-Newton step; moves x.

@@ -31,6 +31,12 @@ def test_unknown_height_of_the_sensor(jump):
         rec.imu, rec.mag, rec.fix, rec.velocity)
     height, sd = (v[0, 0] for v in r.states["body_height"])
     assert abs(height - 1.0) < max(4 * sd, 0.05) and sd < 0.1
+    # Given, it counts as well as found.
+    given = Smoother(SmootherParams(surface=SurfaceContact(body_height=1.0)), believed).run(
+        rec.imu, rec.mag, rec.fix, rec.velocity)
+    up = [np.median((low.to_geodetic(s.samples["position_world"])[2] - jump.hill.origin.to_geodetic(
+        rec.motion.position_world)[2])) for s in (given, r)]
+    assert np.abs(up).max() < 0.05 and given.remarks() == []
 
 
 def test_a_surface_that_does_not_fit_says_so(jump, recording, result):
