@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
-from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
+from imu_fusion.geometry.rotation_arrays import rotation_matrices, rpy_angles
 from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
 from imu_fusion.samples import AttitudeLog, FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 
@@ -79,20 +79,40 @@ def pose_message(stamp, frame_id, quat_world_imu, position_world=(0.0, 0.0, 0.0)
     return POSE.encode(stamp, frame_id, [*position_world, *quat_world_imu])
 
 
-def orientation_message(row, frame_id, has_force=True):
-    """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator.
+def imu_messages(stamp, frame_id, gyr, cov_gyr, acc, cov_acc, quat, cov_orientation, has_force):
+    """CDR bytes of n sensor_msgs/Imu, as :func:`imu_message` makes them one by one.
 
-    ``has_force``: whether the sensor measures specific force; if not it is absent.
+    Args:
+        stamp: (n,) int64 ns. frame_id: of all of them.
+        gyr, acc: (n, 3); quat: (n, 4); the covariances: (n, 3, 3).
+        has_force: (n,) bool, whether acc is there; where not it is marked as absent.
     """
-    rotation = quat_to_matrix(row["quat_world_imu"])
-    return imu_message(row["stamp"], frame_id, row["gyr"], row["acc"] if has_force else None,
-                       row["quat_world_imu"],
-                       rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
+    values = np.zeros((len(stamp), IMU.size))
+    for field, value, cov in (("orientation", quat, cov_orientation),
+                              ("angular_velocity", gyr, cov_gyr),
+                              ("linear_acceleration", acc, cov_acc)):
+        values[:, IMU[field]] = value
+        values[:, IMU[field + "_covariance"]] = np.reshape(cov, (-1, 9))
+    absent = ~has_force
+    values[absent, IMU["linear_acceleration"]] = 0.0
+    values[absent, IMU["linear_acceleration_covariance"]] = ABSENT.ravel()
+    return IMU.encode_block(stamp, frame_id, values)
 
 
-def rpy_message(row, frame_id):
-    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of one row."""
-    return VECTOR3.encode(row["stamp"], frame_id, quat_to_rpy(row["quat_world_imu"]))
+def orientation_messages(rows, frame_id, has_force):
+    """CDR bytes of the sensor_msgs/Imu of rows (n,) of the orientation estimator.
+
+    has_force: (n,) bool, whether the sensor measures specific force; where not it is absent.
+    """
+    rotation = rotation_matrices(rows["quat_world_imu"])
+    cov = rotation @ rows["cov_attitude"] @ rotation.transpose(0, 2, 1)
+    return imu_messages(rows["stamp"], frame_id, rows["gyr"], rows["cov_gyr"], rows["acc"],
+                        rows["cov_acc"], rows["quat_world_imu"], cov, has_force)
+
+
+def rpy_messages(rows, frame_id):
+    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of rows (n,)."""
+    return VECTOR3.encode_block(rows["stamp"], frame_id, rpy_angles(rows["quat_world_imu"]))
 
 
 def bool_message(value):

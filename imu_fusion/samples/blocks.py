@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.samples.guard import Guard
+from imu_fusion.samples.guard import Guard, Verdict, fit_for_use
 
 Samples = tuple[np.ndarray, np.ndarray]
 """Stamps (n,) int64 ns, ascending, and values (n, k) of one topic."""
@@ -34,11 +34,12 @@ class BlockMerger:
     Args:
         topics: names, in order of rank at equal stamps.
         widths: how many numbers a sample of each has.
-        refused: called with (topic, stamps of the samples that its guard has just refused).
+        refused: called with (topic, stamps, list of Verdict) of what its guard has refused.
     """
 
     def __init__(self, topics: Mapping[str, int],
-                 refused: Callable[[str, np.ndarray], object] = lambda topic, stamp: None) -> None:
+                 refused: Callable[[str, np.ndarray, list[Verdict]], object] = lambda *_: None
+                 ) -> None:
         self._widths = dict(topics)
         self._refused = refused
         self.begin(None)
@@ -58,10 +59,13 @@ class BlockMerger:
     def add(self, blocks: Mapping[str, Samples]) -> list[Segment]:
         """Take samples in order of arrival within each topic; return what may be used now."""
         for topic, (stamp, values) in blocks.items():
-            keep, epochs = self.guards[topic].check_block(stamp, values)
-            if not keep.all():
-                self._refused(topic, stamp[~keep])
-                stamp, values, epochs = stamp[keep], values[keep], epochs[keep]
+            verdicts, epochs = self.guards[topic].check_block(stamp, values)
+            if verdicts is not None:
+                keep = fit_for_use(verdicts, len(stamp))
+                if not keep.all():
+                    self._refused(topic, stamp[~keep],
+                                  [v for v in verdicts if v is not Verdict.OK])
+                    stamp, values, epochs = stamp[keep], values[keep], epochs[keep]
             self._waiting[topic].append(stamp, epochs, values)
         return self._release()
 
@@ -79,6 +83,10 @@ class BlockMerger:
         bound = self._bound()
         taken = {topic: waiting.take(bound) for topic, waiting in self._waiting.items()}
         segments = []
+        if all((epochs == self._epoch).all() for _, epochs, _ in taken.values()):
+            samples = {topic: (stamp, values) for topic, (stamp, _, values) in taken.items()
+                       if len(stamp)}
+            return [Segment(False, samples)] if samples else []
         for epoch in np.unique(np.concatenate([epochs for _, epochs, _ in taken.values()])):
             samples = {topic: (stamp[epochs == epoch], values[epochs == epoch])
                        for topic, (stamp, epochs, values) in taken.items()

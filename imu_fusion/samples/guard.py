@@ -68,7 +68,8 @@ class Guard:
         return {verdict.value: count for verdict, count in self.counts.items()
                 if verdict is not Verdict.OK and count}
 
-    def check_block(self, stamp: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def check_block(self, stamp: np.ndarray,
+                    values: np.ndarray) -> tuple[list[Verdict] | None, np.ndarray]:
         """Judge the next n samples, as :meth:`check` would one by one.
 
         Args:
@@ -76,20 +77,26 @@ class Guard:
             values: (n, k) float64.
 
         Returns:
-            Which are fit for use, (n,) bool, and the epoch of each, (n,) int64.
+            The verdicts, None if all are fit for use, and the epoch of each, (n,) int64.
         """
         n = len(stamp)
         if n and (self.last is None or stamp[0] > self.last) and (
                 (np.diff(stamp) > 0).all() and np.isfinite(values).all()):
             self.counts[Verdict.OK] += n
             self.last = int(stamp[-1])
-            return np.ones(n, dtype=bool), np.full(n, self.epoch, dtype=np.int64)
-        keep = np.zeros(n, dtype=bool)
-        epochs = np.zeros(n, dtype=np.int64)
+            return None, np.full(n, self.epoch, dtype=np.int64)
+        verdicts, epochs = [], np.zeros(n, dtype=np.int64)
         for i in range(n):
-            keep[i] = self.check(int(stamp[i]), values[i]) is Verdict.OK
+            verdicts.append(self.check(int(stamp[i]), values[i]))
             epochs[i] = self.epoch
-        return keep, epochs
+        return verdicts, epochs
+
+
+def fit_for_use(verdicts: list[Verdict] | None, count: int) -> np.ndarray:
+    """(count,) bool of the verdicts of :meth:`Guard.check_block`."""
+    if verdicts is None:
+        return np.ones(count, dtype=bool)
+    return np.array([verdict is Verdict.OK for verdict in verdicts], dtype=bool)
 
 
 def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
@@ -99,5 +106,6 @@ def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
         (log of what is fit for use, epochs (n,) int64 of its samples, Guard with the counts)
     """
     guard = Guard()
-    keep, epochs = guard.check_block(log.stamp, log.flat())
+    verdicts, epochs = guard.check_block(log.stamp, log.flat())
+    keep = fit_for_use(verdicts, len(log))
     return (log, epochs, guard) if keep.all() else (log[keep], epochs[keep], guard)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_fusion.samples.blocks import BlockMerger
-from imu_fusion.samples.guard import JUMP_BACK, Guard, Verdict
+from imu_fusion.samples.guard import JUMP_BACK, Guard, Verdict, fit_for_use
 
 TOPICS = {"fix": 1, "mag": 1, "imu": 1}
 SECOND = 1_000_000_000
@@ -107,9 +107,10 @@ def test_live_everything_is_released_at_once_and_all_clocks_go_back_together():
 
 def test_what_is_refused_is_told_with_its_topic():
     told = []
-    merger = BlockMerger(TOPICS, lambda topic, stamp: told.append((topic, stamp.tolist())))
+    merger = BlockMerger(TOPICS, lambda topic, stamp, verdicts: told.append(
+        (topic, stamp.tolist(), verdicts)))
     merger.add({"imu": (np.array([1, 1, 2, 3]), np.array([[0.0], [0.0], [np.nan], [0.0]]))})
-    assert told == [("imu", [1, 2])]
+    assert told == [("imu", [1, 2], [Verdict.DUPLICATE, Verdict.NOT_FINITE])]
     assert merger.guards["imu"].refused() == {
         Verdict.DUPLICATE.value: 1, Verdict.NOT_FINITE.value: 1}
 
@@ -124,7 +125,9 @@ def test_a_guard_judges_blocks_as_samples(sizes):
                   for s, v in zip(stamp, values)]
     start, found = 0, []
     for size in sizes:
-        keep, epochs = blocks.check_block(stamp[start:start + size], values[start:start + size])
+        verdicts, epochs = blocks.check_block(stamp[start:start + size],
+                                              values[start:start + size])
+        keep = fit_for_use(verdicts, size)
         found += list(zip(keep.tolist(), epochs.tolist()))
         start += size
     assert found == one_by_one and blocks.counts == single.counts
