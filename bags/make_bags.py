@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import (
     bool_message, fix_message, imu_message, mag_message, pose_message, string_message,
     velocity_message)

@@ -10,8 +10,8 @@ from benchmarks.data import config, data_path
 from benchmarks.jumps import write
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother
-from imu_fusion.recordings.bag import open_bag
-from imu_fusion.messages.convert import read_log
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.surfaces.file import load_surface
 
 # A site is flat to 0.3 m over its length, not anew every 10 ms: some seconds of driving.

@@ -136,7 +136,8 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
               help="Copy all that can be read into a clean recording OUT.")
 def info(bag, target):
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
-    from imu_fusion.recordings.bag import open_bag, repair
+    from imu_fusion.recordings.bag_reader import open_bag
+    from imu_fusion.recordings.repair import repair
     from imu_fusion.recordings.inspect import inspect_topics
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
@@ -193,7 +194,8 @@ def convert(source, out, topics, description, remap, overwrite):
         click.echo(f"written: {out} with "
                    + ", ".join(f"{n} of {topic}" for topic, n in sorted(counts.items())))
         return
-    from imu_fusion.recordings.bag import BagWriter, open_bag
+    from imu_fusion.recordings.bag_reader import open_bag
+    from imu_fusion.recordings.bag_writer import BagWriter
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)

@@ -34,12 +34,12 @@ def shutdown_if_failed(action):
 
 def start(context):
     """The nodes for the arguments given: the acceleration field's where it is configured."""
-    from imu_fusion.batch import field_configuration
+    from imu_fusion.streams.acceleration_field import read_configuration
 
     given = {name: LaunchConfiguration(name).perform(context)
              for name in ("bag", "out", "rate", "params_file", "report")}
     estimators = ["smoother", "orientation_estimator"]
-    if field_configuration(given["params_file"]).accelerometers:
+    if read_configuration(given["params_file"]).accelerometers:
         estimators.append("acceleration_field_estimator")
 
     def node(name, **parameters):

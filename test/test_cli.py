@@ -7,7 +7,8 @@ from click.testing import CliRunner
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imu_fusion import cli
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.messages.layouts import IMU, MAG
 

@@ -13,8 +13,9 @@ from imu_fusion.errors import ParameterError
 from imu_fusion.evaluation.orientation_error import (moving_at, orientation_errors, shares_within,
                                                      statistics)
 from imu_fusion.nodes.processes import Graph
-from imu_fusion.recordings.bag import open_bag
-from imu_fusion.messages.convert import attitude_log, bool_value, read_log
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.messages.convert import attitude_log, bool_value
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.recording import write_recording_report
 
 

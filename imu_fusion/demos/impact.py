@@ -7,8 +7,8 @@ from rich.table import Table
 from imu_fusion.batch import process
 from imu_fusion.demos.trajectory import shared
 from imu_fusion.nodes.processes import Graph
-from imu_fusion.recordings.bag import open_bag
-from imu_fusion.messages.convert import read_log
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.parameters.file import load
 from imu_fusion.report.recording import write_recording_report
 

@@ -13,8 +13,10 @@ import imu_fusion
 from imu_fusion.nodes import pipeline
 from imu_fusion.errors import BagError
 from imu_fusion.evaluation.consistency import nees
-from imu_fusion.recordings.bag import BagWriter, open_bag
-from imu_fusion.messages.convert import read_log, string_value
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.messages.convert import string_value
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.streams.smoother import FIX_TOPIC, SMOOTHED_FIX_TOPIC, VELOCITY_TOPIC
 from imu_fusion.report.recording import write_recording_report
 

@@ -1,8 +1,9 @@
-"""Rotation kernels for hot loops (numba, scalar, no broadcasting).
+"""Rotations for hot loops (numba, scalar, no broadcasting).
 
-Quaternions are Hamilton, active, ``x, y, z, w``. Arrays are float64 and
-one-dimensional; whole logs are better served by ``scipy.spatial.transform``. Where an array per
-call costs too much, :mod:`imu_fusion.geometry.quaternion` has the same with tuples.
+Quaternions are Hamilton, active, ``x, y, z, w``. Quaternions and vectors may be tuples or
+one-dimensional arrays, and come back as tuples of floats, so that a chain of them allocates
+nothing: assign one to a slice, or write ``np.array(...)`` for arithmetic. Matrices are float64
+arrays (3, 3). Whole logs are better served by ``scipy.spatial.transform``.
 """
 
 import math
@@ -10,47 +11,77 @@ import math
 import numpy as np
 from imu_fusion.kernels import njit
 
-from imu_fusion.geometry import quaternion
-
-
-@njit
-def _array(values):
-    """A tuple of floats as an array."""
-    out = np.empty(len(values))
-    for i in range(len(values)):
-        out[i] = values[i]
-    return out
-
-
-@njit
-def skew(v):
-    """Matrix [v]x with ``skew(v) @ u == cross(v, u)``. v: (3,). Returns (3, 3)."""
-    m = np.zeros((3, 3))
-    m[0, 1] = -v[2]
-    m[0, 2] = v[1]
-    m[1, 0] = v[2]
-    m[1, 2] = -v[0]
-    m[2, 0] = -v[1]
-    m[2, 1] = v[0]
-    return m
+# Below this angle the truncated series are exact to float64 rounding:
+# the first neglected term is of the order angle^6 / 5040 of the value.
+_SMALL = 1e-3
 
 
 @njit
 def quat_multiply(p, q):
-    """Hamilton product p * q. p, q: (4,). Returns (4,)."""
-    return _array(quaternion.multiply(p, q))
+    """Hamilton product p * q."""
+    return (p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1],
+            p[3] * q[1] - p[0] * q[2] + p[1] * q[3] + p[2] * q[0],
+            p[3] * q[2] + p[0] * q[1] - p[1] * q[0] + p[2] * q[3],
+            p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2])
 
 
 @njit
 def quat_conjugate(q):
-    """Inverse of a unit quaternion. q: (4,). Returns (4,)."""
-    return _array(quaternion.conjugate(q))
+    """Inverse of a unit quaternion."""
+    return -q[0], -q[1], -q[2], q[3]
 
 
 @njit
 def quat_normalize(q):
-    """q scaled to unit length. q: (4,), not zero. Returns (4,)."""
-    return _array(quaternion.normalize(q))
+    """q, not zero, scaled to unit length."""
+    size = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return q[0] / size, q[1] / size, q[2] / size, q[3] / size
+
+
+@njit
+def quat_rotate(q, v):
+    """v turned by the unit quaternion q."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    tx = 2.0 * (y * v[2] - z * v[1])
+    ty = 2.0 * (z * v[0] - x * v[2])
+    tz = 2.0 * (x * v[1] - y * v[0])
+    return (v[0] + w * tx + y * tz - z * ty,
+            v[1] + w * ty + z * tx - x * tz,
+            v[2] + w * tz + x * ty - y * tx)
+
+
+@njit
+def quat_rotate_inverse(q, v):
+    """v turned by the inverse of the unit quaternion q."""
+    return quat_rotate(quat_conjugate(q), v)
+
+
+@njit
+def quat_exp(phi, scale=1.0):
+    """Unit quaternion of the rotation vector ``scale * phi``, rad."""
+    a, b, c = scale * phi[0], scale * phi[1], scale * phi[2]
+    angle2 = a * a + b * b + c * c
+    angle = math.sqrt(angle2)
+    if angle < _SMALL:
+        s = 0.5 - angle2 / 48.0 + angle2 * angle2 / 3840.0
+    else:
+        s = math.sin(0.5 * angle) / angle
+    return s * a, s * b, s * c, math.cos(0.5 * angle)
+
+
+@njit
+def quat_log(q):
+    """Rotation vector of a unit quaternion, of angle at most pi, rad."""
+    n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
+    n = math.sqrt(n2)
+    sign = 1.0 if q[3] >= 0.0 else -1.0
+    w = abs(q[3])
+    if n < _SMALL:
+        t = n / w
+        s = 2.0 / w * (1.0 - t * t / 3.0 + t ** 4 / 5.0)
+    else:
+        s = 2.0 * math.atan2(n, w) / n
+    return sign * s * q[0], sign * s * q[1], sign * s * q[2]
 
 
 @njit
@@ -74,7 +105,7 @@ def quat_to_matrix(q):
 def quat_from_matrix(m):
     """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978).
 
-    m: (3, 3). Returns (4,) with a non-negative largest component.
+    m: (3, 3). The largest component of the result is not negative.
     """
     q = np.empty(4)
     trace = m[0, 0] + m[1, 1] + m[2, 2]
@@ -106,50 +137,25 @@ def quat_from_matrix(m):
 def quat_to_rpy(q):
     """Roll, pitch, yaw of a unit quaternion: R = Rz(yaw) Ry(pitch) Rx(roll) (REP 103).
 
-    Returns (3,) rad, pitch within +-pi/2; at pitch = +-pi/2 only roll -+ yaw is defined.
+    Rad, pitch within +-pi/2; at pitch = +-pi/2 only roll -+ yaw is defined.
     """
     x, y, z, w = q[0], q[1], q[2], q[3]
-    rpy = np.empty(3)
-    rpy[0] = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    rpy[1] = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
-    rpy[2] = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return rpy
+    return (math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
+            math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
 @njit
-def quat_rotate(q, v):
-    """v turned by the unit quaternion q. q: (4,), v: (3,). Returns (3,)."""
-    return _array(quaternion.rotate(q, v))
-
-
-@njit
-def quat_rotate_inverse(q, v):
-    """v turned by the inverse of the unit quaternion q. Returns (3,)."""
-    return quat_rotate(quat_conjugate(q), v)
-
-
-@njit
-def quat_exp(phi):
-    """Unit quaternion of a rotation vector. phi: (3,) rad. Returns (4,)."""
-    return _array(quaternion.exp(phi, 1.0))
-
-
-@njit
-def quat_log(q):
-    """Rotation vector of a unit quaternion, of angle at most pi. Returns (3,) rad."""
-    return _array(quaternion.log(q))
-
-
-@njit
-def so3_exp(phi):
-    """Rotation matrix of a rotation vector. phi: (3,) rad. Returns (3, 3)."""
-    return quat_to_matrix(quat_exp(phi))
-
-
-@njit
-def so3_log(m):
-    """Rotation vector of a rotation matrix. m: (3, 3). Returns (3,) rad."""
-    return quat_log(quat_from_matrix(m))
+def skew(v):
+    """Matrix [v]x with ``skew(v) @ u == cross(v, u)``. v: (3,). Returns (3, 3)."""
+    m = np.zeros((3, 3))
+    m[0, 1] = -v[2]
+    m[0, 2] = v[1]
+    m[1, 0] = v[2]
+    m[1, 2] = -v[0]
+    m[2, 0] = -v[1]
+    m[2, 1] = v[0]
+    return m
 
 
 @njit
@@ -177,17 +183,3 @@ def right_jacobian(phi):
     j[2, 0] += b * phi[1]
     j[2, 1] -= b * phi[0]
     return j
-
-
-@njit
-def right_jacobian_inverse(phi):
-    """Inverse of :func:`right_jacobian`, for angles below 2 pi. Returns (3, 3)."""
-    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    angle = math.sqrt(angle2)
-    if angle < 1e-2:
-        c = 1.0 / 12.0 + angle2 / 720.0 + angle2 * angle2 / 30240.0
-    else:
-        half = 0.5 * angle
-        c = (1.0 - half * math.cos(half) / math.sin(half)) / angle2
-    k = skew(phi)
-    return np.eye(3) + 0.5 * k + c * (k @ k)

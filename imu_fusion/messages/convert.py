@@ -232,24 +232,3 @@ def attitude_log(messages):
     samples = imu_values(values)
     return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,
                        samples[:, :3], samples[:, 3:], frames[0] if frames else "")
-
-
-def read_log(reader, topic, log_of=None):
-    """The log of one topic of an open recording.
-
-    Args:
-        reader: what :func:`imu_fusion.recordings.bag.open_bag` returned.
-        topic: name, with or without leading slash.
-        log_of: function of a list of messages, if not the one of its type
-            (such as :func:`attitude_log`).
-
-    Raises:
-        TopicError: no such topic, or a type that has no log.
-        MessageError: bytes that do not fit the type.
-    """
-    info = reader.require(topic)
-    if log_of is None and info.msgtype not in SAMPLE_TYPES:
-        raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
-                         f"logs exist for {', '.join(sorted(SAMPLE_TYPES))}")
-    log_of = log_of or SAMPLE_TYPES[info.msgtype].read
-    return log_of([cdr for *_, cdr in reader.messages([info.name])])

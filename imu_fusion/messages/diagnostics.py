@@ -7,7 +7,7 @@ from rosbags.typesys.stores.ros2_jazzy import (
     diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
 
 from imu_fusion.errors import MessageError
-from imu_fusion.recordings.bag import TYPES
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.layouts import NANOSECONDS
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"

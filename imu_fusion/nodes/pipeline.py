@@ -7,10 +7,12 @@ Each node is a process of an own ROS domain. The estimates are those of ``batch.
 
 from pathlib import Path
 
-from imu_fusion.batch import inputs_of, stages, write_results
 from imu_fusion.errors import TopicError
 from imu_fusion.nodes.processes import Graph
-from imu_fusion.recordings.bag import open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.inputs import find_inputs
+from imu_fusion.recordings.results import write_results
+from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
 
 SMOOTHER = "smoother"
@@ -38,19 +40,18 @@ def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, log
     Raises:
         ImuFusionError: recording, parameters or topics are not usable, or a node failed.
     """
-    known = stages()
     for name in without:
-        if name not in known or name == SMOOTHER:
+        if name not in STAGES or name == SMOOTHER:
             raise TopicError(f"no estimator '{name}' to leave out; there are: "
-                             + ", ".join(set(known) - {SMOOTHER}))
+                             + ", ".join(set(STAGES) - {SMOOTHER}))
     renamed, estimators, made = {}, [], set()
     with open_bag(bag) as reader:
-        for stage in known.values():
+        for stage in STAGES.values():
             # Here, for a bad file to be refused before anything starts.
             stage, _ = stage.prepare(params_file)
             if stage.node in without or stage.unusable:
                 continue
-            names, missing = inputs_of(stage, reader, remap or {})
+            names, missing = find_inputs(reader, *stage.input_types(), remap or {})
             if missing and stage.node != SMOOTHER:
                 continue
             if missing:

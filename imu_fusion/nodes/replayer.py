@@ -11,7 +11,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from imu_fusion.errors import ParameterError, TopicError
-from imu_fusion.recordings.bag import find_topic, open_bag
+from imu_fusion.recordings.bag_reader import find_topic, open_bag
 from imu_fusion.nodes.base import Node, message_class, run_node
 from imu_fusion.nodes.flow import DEPTH, END, NEXT, FlowSource, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress

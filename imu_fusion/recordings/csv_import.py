@@ -29,7 +29,7 @@ from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
 from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
 from imu_fusion.streams.acceleration_field import (GYROSCOPE_TOPIC, NODE,
                                                            NODE_PARAMETERS, FieldConfiguration)
-from imu_fusion.recordings.bag import BagWriter
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
 from imu_fusion.parameters.declare import Parameters, flatten, param

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_fusion.errors import SampleError
-from imu_fusion.recordings.bag import BagWriter
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
 from imu_fusion.recordings.csv_import import read_number
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, TWIST

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_fusion.errors import MessageError
-from imu_fusion.messages.convert import SAMPLE_TYPES, read_log
+from imu_fusion.messages.convert import SAMPLE_TYPES
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.messages.layouts import NANOSECONDS
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
@@ -70,7 +71,7 @@ def inspect_topics(reader):
     """Inspect every topic of an open recording.
 
     Args:
-        reader: what :func:`imu_fusion.recordings.bag.open_bag` returned.
+        reader: what :func:`imu_fusion.recordings.bag_reader.open_bag` returned.
 
     Returns:
         list of TopicReport, in order of their names.

@@ -1,20 +1,20 @@
 """What the report needs of an acceleration field: estimates and readings, read from recordings."""
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.batch import field_configuration
 from imu_fusion.estimation.acceleration_field.rows import (ROW, SATURATED, field_at,
                                                            rigid_gradient)
 from imu_fusion.estimation.acceleration_field.impact_metrics import measure_impacts
 from imu_fusion.streams.acceleration_field import (ACCEL_TOPIC, GYROSCOPE_TOPIC, IMU_TOPIC,
-                                                           NODE, FieldConfiguration)
-from imu_fusion.recordings.bag import find_topic, open_bag
-from imu_fusion.messages.convert import attitude_log, read_log
+                                                           NODE, FieldConfiguration,
+                                                           read_configuration)
+from imu_fusion.recordings.bag_reader import find_topic, open_bag
+from imu_fusion.messages.convert import attitude_log
+from imu_fusion.recordings.logs import read_log
+from imu_fusion.recordings.results import read_results
 from imu_fusion.messages.layouts import ACCEL, IMU
 
 
@@ -86,7 +86,7 @@ def read_field(bag, estimates, params_file=None):
     if len(shared) == 0:
         return None
     rows = _rows(shared, imu[i], covs[i], values[j])
-    config = field_configuration(params_file)
+    config = read_configuration(params_file)
     readings, gyr = _measured(bag, config, rows["stamp"])
     for name, reading in readings.items():
         limit = config.accelerometers[name].range
@@ -155,9 +155,9 @@ def _at(stamps, log_stamps, values, tolerance):
 
 def _impacts(estimates, params_file, config, rows):
     """Metrics that ``process`` has written beside the estimates, or of the rows."""
-    found = Path(estimates) / "results.json"
-    if found.exists():
-        return json.loads(found.read_text()).get(NODE, {}).get("impacts", [])
+    found = read_results(estimates)
+    if found is not None:
+        return found.get(NODE, {}).get("impacts", [])
     if params_file is None:
         return []
     return measure_impacts(rows, config.field.points, config.field.gravity, config.impact)

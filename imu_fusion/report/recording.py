@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.batch import StageReport, stages
 from imu_fusion.errors import EstimationError, SampleError, TopicError
 from imu_fusion.evaluation.orientation_error import moving_at, orientation_errors
 from imu_fusion.streams import smoother as smoothing
-from imu_fusion.recordings.bag import find_topic, open_bag
-from imu_fusion.messages.convert import attitude_log, bool_value, read_log
+from imu_fusion.streams.registry import STAGES
+from imu_fusion.streams.stage import StageReport
+from imu_fusion.recordings.bag_reader import find_topic, open_bag
+from imu_fusion.messages.convert import attitude_log, bool_value
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
@@ -54,7 +56,7 @@ class Contents:
         return self.logs.get(topic)
 
     def samples(self, topics):
-        """dict of topic to (log, epochs), as the stages of batch take it."""
+        """dict of topic to (log, epochs), as a Stage takes it."""
         return {topic: (self.logs[topic], np.zeros(len(self.logs[topic]), np.int64))
                 for topic in topics if topic in self.logs and len(self.logs[topic])}
 
@@ -101,9 +103,9 @@ def estimate_orientation(contents, params_file=None):
     None if it has no imu/data_raw."""
     if RAW not in contents.logs:
         return None, Status.from_messages((), ())
-    stage, params = stages()["orientation_estimator"].prepare(params_file)
-    messages = stage.run(contents.samples(stage.required | stage.optional),
-                         StageReport(stage.node, params), *params)
+    stage, params = STAGES["orientation_estimator"].prepare(params_file)
+    messages = stage.process_logs(contents.samples(stage.inputs),
+                                  StageReport(stage.node, params), *params)
     cdrs = {topic: [] for topic in (ESTIMATES, FLAGS_TOPIC, BIAS_TOPIC)}
     for topic, _, cdr in messages:
         if topic in cdrs:
@@ -120,7 +122,7 @@ def smooth_recording(contents, params_file=None):
     """
     if not set(smoothing.REQUIRED) <= contents.logs.keys():
         return None, None
-    _, (params,) = stages()["smoother"].prepare(params_file)
+    _, (params,) = STAGES["smoother"].prepare(params_file)
     try:
         result = smoothing.smooth(params, contents.samples(smoothing.INPUTS))
     except (EstimationError, SampleError) as error:

@@ -156,7 +156,7 @@ def _shape_table():
 @njit
 def _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step, coefficients):
     """Force (world) and torque about the centre (body) per unit mass, eq. (B.8)-(B.10)."""
-    up = quat_rotate_inverse(q, np.array([0.0, 0.0, 1.0]))
+    up = np.array(quat_rotate_inverse(q, (0.0, 0.0, 1.0)))
     scaled = axes2 * up
     support = np.sqrt(np.sum(scaled * up))
     force = np.array([0.0, 0.0, -gravity])
@@ -189,7 +189,7 @@ def _integrate(n, every, h, r, v, q, w, inertia, r_ref, axes2, ground, gravity, 
         if step % every == 0:
             row = out[step // every]
             alpha = (torque - np.cross(w, inertia * w)) / inertia
-            origin = (quat_rotate_inverse(q, force) - np.cross(alpha, r_ref)
+            origin = (np.array(quat_rotate_inverse(q, force)) - np.cross(alpha, r_ref)
                       - np.cross(w, np.cross(w, r_ref)))
             row[0:4] = q
             row[4:7] = w
@@ -199,14 +199,14 @@ def _integrate(n, every, h, r, v, q, w, inertia, r_ref, axes2, ground, gravity, 
             row[16:19] = v
         v_half = v + 0.5 * h * force
         momentum = inertia * w + 0.5 * h * torque
-        w_half = quat_rotate(quat_exp(-0.5 * h * w), momentum) / inertia
+        w_half = np.array(quat_rotate(quat_exp(w, -0.5 * h), momentum)) / inertia
         turn = h * w_half
         r = r + h * v_half
-        q = quat_normalize(quat_multiply(q, quat_exp(turn)))
+        q[:] = quat_normalize(quat_multiply(q, quat_exp(turn)))
         force, torque = _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step,
                                        coefficients)
         v = v_half + 0.5 * h * force
-        w = (quat_rotate(quat_exp(-turn), momentum) + 0.5 * h * torque) / inertia
+        w = (np.array(quat_rotate(quat_exp(turn, -1.0), momentum)) + 0.5 * h * torque) / inertia
 
 
 def simulate(scene=ImpactScene(), duration=1.0, step=1e-5, every=100):

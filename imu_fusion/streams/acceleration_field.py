@@ -1,6 +1,6 @@
 """The acceleration field estimator between its topics, live and in batch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.messages.convert import SampleType, imu_message
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
+from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import EstimatorNodeParams, Stream
 from imu_fusion.parameters.declare import Parameters, flatten, param
+from imu_fusion.parameters.file import node_values
 from imu_fusion.samples import AccelerometerLog, ImuLog
 from imu_fusion.samples.matching import SampleMatcher
 from imu_fusion.samples.merge import merge_order
@@ -180,7 +182,7 @@ class AccelerationFieldStream(Stream):
                 self.emit(*message)
 
 
-def run(logs, report, config):
+def process_logs(logs, report, config):
     """The messages that :class:`AccelerationFieldStream` emits for a session, from whole logs.
 
     The metrics of impacts, where there are any, go into the report's results.
@@ -188,7 +190,7 @@ def run(logs, report, config):
     Args:
         config: FieldConfiguration.
         logs: dict of input topic to (log, epochs) of guarded samples; a topic may lack.
-        report: batch.StageReport.
+        report: StageReport.
 
     Yields:
         (topic, stamp, cdr)
@@ -227,3 +229,28 @@ def _impacts(config, rows):
 
 
 NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, MatchingParams, ImpactParams)
+
+
+def read_configuration(params_file):
+    """The FieldConfiguration in a parameter file (or None).
+
+    Raises:
+        ParameterError, LayoutError: with the name of what is wrong.
+    """
+    values = node_values(NODE, params_file, FieldConfiguration.names())
+    for info in EstimatorNodeParams.infos():
+        values.pop(info.name, None)
+    return FieldConfiguration.from_mapping(values, str(params_file or ""))
+
+
+def _configure(stage, params_file):
+    config = read_configuration(params_file)
+    required = tuple(topic for topic in config.inputs if topic != GYROSCOPE_TOPIC)
+    return replace(
+        stage, inputs=config.inputs, required=required, unusable="" if config.accelerometers else
+        "no accelerometers described; set accelerometers.names in a parameter file"), [config]
+
+
+# Its topics are those of the accelerometers that a parameter file describes.
+STAGE = Stage(NODE, (FieldConfiguration,), (EstimatorNodeParams,), {}, (), OUTPUTS, process_logs,
+              configure=_configure)

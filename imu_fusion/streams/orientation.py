@@ -16,7 +16,8 @@ from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_mes
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
 from imu_fusion.messages.orientation_status import (FLAGS_TYPE, bias_message, flags_message,
                                                     lasting_flags)
-from imu_fusion.streams.stream import Stream
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import EstimatorNodeParams, Stream
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import MagLog, checks
 from imu_fusion.sensors.magnetometer_calibration import MagCalibrator
@@ -99,7 +100,7 @@ class _Writer:
                 self._next_bias = stamp + _BIAS_INTERVAL
                 yield BIAS_TOPIC, stamp, bias_message(row, frame_id)
         if len(rows):
-            east = quat_rotate(row["quat_world_imu"], np.array([1.0, 0.0, 0.0]))
+            east = quat_rotate(row["quat_world_imu"], (1.0, 0.0, 0.0))
             self.yaw = math.atan2(self._up * east[1], east[0])
 
     def corrected(self, rows, frame_id):
@@ -125,10 +126,10 @@ class _Writer:
 
     def _changed(self, row, has_force):
         row = row.copy()
-        turn = quat_exp(np.array([0.0, 0.0, self._up * self.turn]))
+        turn = quat_exp((0.0, 0.0, self._up * self.turn))
         row["quat_world_imu"] = quat_multiply(turn, row["quat_world_imu"])
         if self._output.remove_gravity_vector and has_force:
-            up = np.array([0.0, 0.0, self._up * self._output.gravity])
+            up = (0.0, 0.0, self._up * self._output.gravity)
             row["acc"] -= quat_rotate_inverse(row["quat_world_imu"], up)
         return row
 
@@ -282,7 +283,7 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def run(logs, report, params, output):
+def process_logs(logs, report, params, output):
     """The messages that :class:`OrientationStream` emits for a session, from whole logs.
 
     Args:
@@ -336,3 +337,7 @@ def _first_north(params, fix, mask):
         if turn is not None:
             return stamp, turn
     return None, 0.0
+
+
+STAGE = Stage("orientation_estimator", (OrientationParams, OrientationOutputParams),
+              (EstimatorNodeParams,), INPUTS, (IMU_TOPIC,), OUTPUTS, process_logs, findings)

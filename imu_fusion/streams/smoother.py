@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, MessageError, SampleError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.recordings.bag import TYPES
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
 from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
                                              diagnostics_value)
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
+from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.parameters.declare import param
 from imu_fusion.samples import checks
@@ -314,7 +315,7 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def run(logs, report, params):
+def process_logs(logs, report, params):
     """Batch: the messages that the node publishes after smoothing the same samples."""
     try:
         result = smooth(params, logs)
@@ -325,3 +326,14 @@ def run(logs, report, params):
     report.summary, report.results = outcome.summary, outcome.numbers
     report.remarks = outcome.remarks
     yield from messages(result.samples, outcome, params.path_rate)
+
+
+def _configure(stage, params_file):
+    (params,) = stage.read_params(params_file)
+    if params.surface:
+        load_surface(params.surface)  # a bad file is refused before anything is read
+    return stage, [params]
+
+
+STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, REQUIRED, OUTPUTS,
+              process_logs, findings, _configure)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import TopicError
 from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
 from imu_fusion.messages import convert
-from imu_fusion.recordings.bag import TYPES
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.layouts import FIX, IMU, POSE, TWIST
 
 STAMP = 1_700_000_123_456_789_012

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import MessageError
-from imu_fusion.recordings.bag import TYPES
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, ODOMETRY
 
 STAMP = 1_700_000_123_456_789_012

@@ -8,7 +8,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu
 
-from imu_fusion.recordings.bag import BagWriter
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.nodes.base import use_fast_heartbeats
 from imu_fusion.nodes.flow import FlowSink

@@ -15,7 +15,8 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import ParameterError
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, MAG, VECTOR3
 from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value

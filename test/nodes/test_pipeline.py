@@ -7,7 +7,8 @@ import pytest
 from imu_fusion import batch
 from imu_fusion.nodes import pipeline
 from imu_fusion.errors import EstimationError, LayoutError, TopicError
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
 from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value

@@ -12,7 +12,7 @@ from sensor_msgs.msg import Imu
 
 from imu_fusion.kernels import NOTICE
 from imu_fusion.nodes.processes import Graph
-from imu_fusion.recordings.bag import open_bag
+from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
 from test.nodes.conftest import START, STEP, collector

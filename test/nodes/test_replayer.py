@@ -7,7 +7,8 @@ from sensor_msgs.msg import Imu, MagneticField
 from std_srvs.srv import Trigger
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.nodes.flow import END, NEXT
 from imu_fusion.nodes.replayer import Replayer
 from test.nodes.conftest import START, STEP, collector, write_bag

@@ -10,7 +10,8 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
 from imu_fusion.streams.smoother import (

@@ -15,8 +15,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from imu_fusion.errors import BagError, TopicError
-from imu_fusion.recordings.bag import TYPES, BagWriter, open_bag, qos_profile, repair
-from imu_fusion.messages.convert import imu_message, mag_message, read_log
+from imu_fusion.messages.typestore import TYPES
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.qos import qos_profile
+from imu_fusion.recordings.repair import repair
+from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.messages.layouts import IMU, MAG
 
 START = 1_700_000_000_000_000_000

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from imu_fusion import batch, cli
 from imu_fusion.errors import ImuFusionError
-from imu_fusion.recordings.bag import open_bag
+from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.csv_import import import_csv
 from imu_fusion.messages.layouts import IMU
 

@@ -6,8 +6,9 @@ from click.testing import CliRunner
 
 from benchmarks.data import data_path
 from imu_fusion import batch, cli
-from imu_fusion.recordings.bag import open_bag
-from imu_fusion.messages.convert import attitude_log, read_log
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.messages.convert import attitude_log
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.importers import AVANODE_EPOCH, PHYPHOX_EPOCH
 from imu_fusion.messages.layouts import ODOMETRY
 

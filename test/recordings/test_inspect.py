@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_fusion.recordings.bag import BagWriter, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.messages.layouts import VECTOR3

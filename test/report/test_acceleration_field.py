@@ -8,7 +8,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.streams.acceleration_field import ACCEL_TOPIC, IMU_TOPIC
-from imu_fusion.recordings.bag import BagWriter
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.report.acceleration_field import field_picture, field_sections

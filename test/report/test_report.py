@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError, TopicError
-from imu_fusion.recordings.bag import BagWriter
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message, pose_message
 from imu_fusion.report.figures import (
     Band, Line, Panel, Shade, break_wraps, intervals, merged, time_figure)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from imu_fusion import cli
 from imu_fusion.estimation.smoother import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.recordings.bag import open_bag
-from imu_fusion.messages.convert import read_log
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.report import smoother as report
 from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.recording import read_contents, smooth_recording, write_recording_report

@@ -120,7 +120,7 @@ def _put_smoothed(stamp, readings, mean, cov, quat, is_gyro, direction, lever, v
                   max_gap, reference, gravity, specific_force, values, flags):
     index = np.empty(TOUCHED, np.int64)
     row = np.empty(TOUCHED)
-    quat = quat_normalize(quat_multiply(quat, quat_exp(mean[0, 0:3])))
+    quat[:] = quat_normalize(quat_multiply(quat, quat_exp(mean[0, 0:3])))
     x = np.zeros(18)
     for n in range(len(stamp)):
         if n > 0:
@@ -131,7 +131,7 @@ def _put_smoothed(stamp, readings, mean, cov, quat, is_gyro, direction, lever, v
             else:
                 phi = (0.5 * dt * (w0 + w1)
                        + dt * dt / 12.0 * (mean[n - 1, 6:9] - mean[n, 6:9] + np.cross(w0, w1)))
-                quat = quat_normalize(quat_multiply(quat, quat_exp(phi)))
+                quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
         squares, used = 0.0, 0
         for c in range(len(variance)):
             if np.isnan(readings[n, c]):

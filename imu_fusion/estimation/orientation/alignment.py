@@ -12,8 +12,7 @@ import numpy as np
 from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation import mag_limit as limit
-from imu_fusion.geometry import quaternion
-from imu_fusion.geometry.rotation import quat_from_matrix
+from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
 from imu_fusion.sensors.saturation import saturated_axes
 
 # Largest rate that can be a gyroscope's bias, and largest scatter of rate and specific
@@ -104,7 +103,7 @@ def _chain(stamps, gyr):
     for i in range(1, len(stamps)):
         dt = (stamps[i] - stamps[i - 1]) * 1e-9
         twice = (gyr[i - 1, 0] + gyr[i, 0], gyr[i - 1, 1] + gyr[i, 1], gyr[i - 1, 2] + gyr[i, 2])
-        quat = quaternion.multiply(quat, quaternion.exp(twice, 0.5 * dt))
+        quat = quat_multiply(quat, quat_exp(twice, 0.5 * dt))
         chain[i] = quat
     return chain
 
@@ -113,7 +112,7 @@ def _chain(stamps, gyr):
 def _rotate_all(chain, vectors):
     out = np.empty_like(vectors)
     for i in range(len(vectors)):
-        out[i] = quaternion.rotate(chain[i], vectors[i])
+        out[i] = quat_rotate(chain[i], vectors[i])
     return out
 
 
@@ -197,7 +196,7 @@ def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr
     c, s = math.cos(yaw_offset), math.sin(yaw_offset)
     r = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ r
     return Alignment(
-        quat_world_imu=quat_from_matrix(r),
+        quat_world_imu=np.array(quat_from_matrix(r)),
         cov_attitude_world=np.diag([tilt_variance, tilt_variance, heading_variance]),
         field_world=None if field_first is None else r @ field_first,
         gyr_bias=bias, gyr_bias_sd=float(bias_sd), at_rest=at_rest, has_heading=has_heading,

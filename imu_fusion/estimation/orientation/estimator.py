@@ -352,8 +352,8 @@ class OrientationEstimator:
             gyr_limits=limits_of(samples[:, :3], par))
         if not self._alignment.has_heading and self._yaw:
             turn = self._yaw - quat_to_rpy(self._alignment.quat_world_imu)[2]
-            self._alignment = replace(self._alignment, quat_world_imu=quat_multiply(
-                quat_exp(np.array([0.0, 0.0, turn])), self._alignment.quat_world_imu))
+            self._alignment = replace(self._alignment, quat_world_imu=np.array(
+                quat_multiply(quat_exp((0.0, 0.0, turn)), self._alignment.quat_world_imu)))
         self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - self._par[st.P_GYR_DELAY]
         self._kernel.initialise(self._x, self._k, par, self._alignment)
         self._k[st.ALIGN_UNTIL] = stamps[-1]

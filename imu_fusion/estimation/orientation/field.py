@@ -10,7 +10,6 @@ from imu_fusion.estimation.orientation import state as st
 from imu_fusion.estimation.orientation.fusion_layout import (
     BLOCK_MAGS, COV, HEADING_VAR, MAG_SUM, MOVE, N, NORM, P_HEADING_SD, P_LOCAL_SD,
     P_MAG_RELATIVE, P_NORM_FACTOR, P_OFFSET_SD, P_SOFT_SD, S, WORLD_TURNED)
-from imu_fusion.geometry import quaternion
 from imu_fusion.geometry.rotation import (
     quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix)
 
@@ -91,17 +90,17 @@ def _fix_heading(x, k, par, z):
     known = horizontal >= 0.02 * norm
     # The needle points to azimuth D: east sin D, north cos D.
     angle = 0.5 * math.pi - par[st.P_DECLINATION] - math.atan2(z[1], z[0]) if known else 0.0
-    turn = quat_exp(np.array([0.0, 0.0, angle]))
+    turn = quat_exp((0.0, 0.0, angle))
     x[st.Q:st.Q + 4] = quat_multiply(turn, x[st.Q:st.Q + 4])
     cov = x[COV:COV + N * N].reshape(N, N)
     for group in (es.ATT, es.VEL, es.POS):
         x[S + group:S + group + 3] = quat_rotate(turn, x[S + group:S + group + 3])
         for j in range(N):
-            cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j].copy())
+            cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j])
         for j in range(N):
-            cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3].copy())
+            cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3])
     # The sensor may be moving: what it shows now is no anchor.
-    start_field(x, k, par, quat_rotate(turn, z), known, 1.0 if known else 0.0)
+    start_field(x, k, par, np.array(quat_rotate(turn, z)), known, 1.0 if known else 0.0)
 
 
 @njit
@@ -133,7 +132,7 @@ def collect_mags(x, k, par, samples, count):
         raw = (samples[s, 0] / norm, samples[s, 1] / norm, samples[s, 2] / norm)
         m = _calibrated(x, raw)
         rate = samples[s, 3:6]
-        r = quat_to_matrix(quaternion.multiply(quat, samples[s, 6:10]))
+        r = quat_to_matrix(quat_multiply(quat, samples[s, 6:10]))
         drag = (rate[1] * m[2] - rate[2] * m[1], rate[2] * m[0] - rate[0] * m[2],
                 rate[0] * m[1] - rate[1] * m[0])
         for i in range(3):
@@ -143,7 +142,7 @@ def collect_mags(x, k, par, samples, count):
                 x[offset_row + 3 * i + j] += r[i, j]
                 for c in range(3):
                     x[soft_row + 9 * i + 3 * j + c] += r[i, j] * raw[c]
-        now = quaternion.rotate(samples[s, 6:10], m)
+        now = quat_rotate(samples[s, 6:10], m)
         mean = (mean[0] + now[0] / count, mean[1] + now[1] / count, mean[2] + now[2] / count)
         k[BLOCK_MAGS] += 1
     for i in range(3):

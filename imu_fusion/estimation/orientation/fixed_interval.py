@@ -14,8 +14,8 @@ from imu_fusion.kernels import njit
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation import fusion
 from imu_fusion.estimation.orientation import state as st
-from imu_fusion.geometry import quaternion
-from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.geometry.rotation import (
+    quat_conjugate, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix)
 
 N = es.N
 _SEGMENT = 128      # blocks between snapshots
@@ -155,13 +155,13 @@ def _clipped(row_int):
 def _correct_row(row, par, error, cov, heading_var, clipped, limits):
     """Apply the error (N,) and its covariance (12, 12) to one output row."""
     frame = par[st.P_FRAME:st.P_FRAME + 4]
-    back = quaternion.conjugate(frame)
-    turn = quaternion.exp(error[es.ATT:es.ATT + 3], 1.0)
-    quat = quaternion.normalize(quaternion.multiply(turn, quaternion.multiply(
-        back, row[st.ROW_QUAT:st.ROW_QUAT + 4])))
-    row[st.ROW_QUAT:st.ROW_QUAT + 4] = quaternion.normalize(quaternion.multiply(frame, quat))
-    turn_out = quaternion.multiply(frame, quaternion.multiply(turn, back))
-    row[st.ROW_MAG:st.ROW_MAG + 3] = quaternion.rotate(turn_out, row[st.ROW_MAG:st.ROW_MAG + 3])
+    back = quat_conjugate(frame)
+    turn = quat_exp(error[es.ATT:es.ATT + 3])
+    quat = quat_normalize(quat_multiply(
+        turn, quat_multiply(back, row[st.ROW_QUAT:st.ROW_QUAT + 4])))
+    row[st.ROW_QUAT:st.ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, quat))
+    turn_out = quat_multiply(frame, quat_multiply(turn, back))
+    row[st.ROW_MAG:st.ROW_MAG + 3] = quat_rotate(turn_out, row[st.ROW_MAG:st.ROW_MAG + 3])
     rate = row[st.ROW_GYR:st.ROW_GYR + 3].copy()
     for i in range(3):
         row[st.ROW_BIAS + i] += error[es.BIAS + i]

@@ -37,8 +37,7 @@ from imu_fusion.estimation.orientation.fusion_layout import (
     P_SURGE_SD, P_SURGE_TIME, P_USE_ACC, P_VEL_SD, P_VEL_TIME, REPEATS, REST_SINCE, S, SLOPE,
     SWAY, WAS_CLIPPED, WORLD_TURNED, X_SIZE)
 from imu_fusion.estimation.orientation.state import push_mag
-from imu_fusion.geometry import quaternion
-from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
 
 # What every kernel offers beside its functions.
 __all__ = ["K_SIZE", "P_SIZE", "X_SIZE", "advance", "initialise", "pack", "push_mag", "run_loop",
@@ -233,8 +232,7 @@ def _end_block(x, k, par, still, back, gyr, last, tape):
     if k[BLOCK_MAGS] > 0:
         update_mag(x, k, par, error, still, tape)
 
-    x[st.Q:st.Q + 4] = quaternion.normalize(quaternion.multiply(quaternion.exp(error, 1.0),
-                                                                x[st.Q:st.Q + 4]))
+    x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(quat_exp(error), x[st.Q:st.Q + 4]))
     for i in range(3, states):
         if par[P_ESTIMATE_BIAS] or i < es.BIAS or i >= es.VEL:
             x[S + i] += error[i]
@@ -307,9 +305,9 @@ def advance(x, k, par, stamp, sample, row, row_int, tape):
                 rate[2] - (back >> 2) * x[excess + 2])
     phi = st.rotation_of_step(rate_last, rate, dt)
     phi = (phi[0] + missed[0], phi[1] + missed[1], phi[2] + missed[2])
-    middle = quat_to_matrix(quaternion.multiply(x[st.Q:st.Q + 4], quaternion.exp(phi, 0.5)))
-    turn = quaternion.exp(phi, 1.0)
-    x[st.Q:st.Q + 4] = quaternion.normalize(quaternion.multiply(x[st.Q:st.Q + 4], turn))
+    middle = quat_to_matrix(quat_multiply(x[st.Q:st.Q + 4], quat_exp(phi, 0.5)))
+    turn = quat_exp(phi)
+    x[st.Q:st.Q + 4] = quat_normalize(quat_multiply(x[st.Q:st.Q + 4], turn))
     k[st.LAST_STAMP] = stamp
     st.push_rotation(x, k, stamp, turn)
     for i in range(3):

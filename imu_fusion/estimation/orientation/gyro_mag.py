@@ -29,10 +29,9 @@ from imu_fusion.estimation.orientation.state import (
     P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_COUNT, Q, SATURATED, STARTED,
     TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
     take_mags, write_row)
-from imu_fusion.geometry import quaternion
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
-    quat_to_matrix, right_jacobian, skew)
+    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse, quat_to_matrix,
+    right_jacobian, skew)
 
 COV = fusion.X_SIZE            # (9, 9): attitude, bias, relative field
 N = 9
@@ -236,7 +235,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
     if k[STARTED]:
         dt = (stamp - k[LAST_STAMP]) * 1e-9
         rate = x[GYR_LAST:GYR_LAST + 3] - bias
-    push_rotation(x, k, stamp, quaternion.exp(rate + rate_next, 0.5 * dt))
+    push_rotation(x, k, stamp, quat_exp(rate + rate_next, 0.5 * dt))
     k[LAST_STAMP] = stamp
     k[STARTED] = 1
     x[GYR_LAST:GYR_LAST + 3] = gyr
@@ -264,13 +263,13 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
     if taken > 0:
         mag[:] = 0.0
         for i in range(taken):
-            mag += quat_rotate(samples[i, 6:10], samples[i, :3]) / taken
+            mag += np.array(quat_rotate(samples[i, 6:10], samples[i, :3])) / taken
     if taken > 0 and k[HEADING_KNOWN]:
         norm = math.sqrt(mag[0] ** 2 + mag[1] ** 2 + mag[2] ** 2)
         reliability = math.exp(-(par[P_RELIABILITY] * (b0 - norm) / b0) ** 2)
         weight = reliability
         unit_mag = mag / b0
-        field = quat_rotate_inverse(quat, x[FIELD:FIELD + 3]) / b0
+        field = np.array(quat_rotate_inverse(quat, x[FIELD:FIELD + 3])) / b0
     # A step has two ends, and at either an axis can be at its limit.
     missing = (clipped | k[WAS_CLIPPED]) if weight > 0.0 else 0
     k[WAS_CLIPPED] = clipped
@@ -280,7 +279,7 @@ def _step_as_printed(x, k, par, stamp, sample, row, row_int):
             keep[i] = _DROPPED
     gain = np.zeros((3, 3))
     phi = solve_step(rate, rate_next, dt, field, unit_mag, weight, keep, gain)
-    r = quat_to_matrix(quat_multiply(quat, quat_exp(0.5 * phi)))
+    r = quat_to_matrix(quat_multiply(quat, quat_exp(phi, 0.5)))
     _propagate(cov, r, dt, par, gap_variance)
     for m in range(3):
         if ((clipped | missing) >> m) & 1:

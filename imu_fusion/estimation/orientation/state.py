@@ -16,8 +16,9 @@ import numpy as np
 from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation import mag_limit as limit
-from imu_fusion.geometry import quaternion
-from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.geometry.rotation import (
+    quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, quat_rotate,
+    quat_to_matrix)
 
 ORIENTATION_DTYPE = np.dtype([
     ("stamp", "<i8"), ("quat_world_imu", "<f8", 4), ("cov_attitude", "<f8", (3, 3)),
@@ -150,7 +151,7 @@ def rotation_of_step(rate, rate_next, dt):
 @njit
 def push_rotation(x, k, stamp, turn):
     """Turn the gyroscope chain by a quaternion (4,), imu axes, and remember it at ``stamp``."""
-    u = quaternion.normalize(quaternion.multiply(x[U:U + 4], turn))
+    u = quat_normalize(quat_multiply(x[U:U + 4], turn))
     x[U:U + 4] = u
     slot = k[HISTORY_COUNT] % HISTORY_LENGTH
     x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4] = u
@@ -172,17 +173,17 @@ def rotation_since(x, k, stamp, turn, rate):
         slot = (count - 1 - back) % HISTORY_LENGTH
         here = k[HISTORY_STAMPS + slot]
         if here < stamp or (here == stamp and (newer >= 0 or count == 1)):
-            since = quaternion.multiply(quaternion.conjugate(x[U:U + 4]),
-                                        x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4])
+            since = quat_multiply(quat_conjugate(x[U:U + 4]),
+                                  x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4])
             rate[:] = 0.0
             if newer >= 0:
-                step = quaternion.log(quaternion.multiply(
-                    quaternion.conjugate(x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4]),
+                step = quat_log(quat_multiply(
+                    quat_conjugate(x[HISTORY + 4 * slot:HISTORY + 4 * slot + 4]),
                     x[HISTORY + 4 * newer:HISTORY + 4 * newer + 4]))
                 span = k[HISTORY_STAMPS + newer] - here
                 for i in range(3):
                     rate[i] = step[i] / (span * 1e-9)
-                since = quaternion.multiply(since, quaternion.exp(step, (stamp - here) / span))
+                since = quat_multiply(since, quat_exp(step, (stamp - here) / span))
             turn[:] = since
             return True
         newer = slot
@@ -311,9 +312,9 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
     mag (3,) is in imu axes, nan if none. Flags and mag_count share a 64-bit word.
     """
     frame = par[P_FRAME:P_FRAME + 4]
-    ahead = quaternion.multiply(quat, quaternion.exp(gyr, par[P_GYR_DELAY]))
+    ahead = quat_multiply(quat, quat_exp(gyr, par[P_GYR_DELAY]))
     row_int[ROW_STAMP] = stamp
-    row[ROW_QUAT:ROW_QUAT + 4] = quaternion.normalize(quaternion.multiply(frame, ahead))
+    row[ROW_QUAT:ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, ahead))
     r = quat_to_matrix(ahead)
     write_cov_attitude(row, par, cov_world, r, gyr)
     for i in range(3):
@@ -325,6 +326,6 @@ def write_row(row, row_int, par, stamp, quat, cov_world, gyr, var_gyr, acc, var_
         row[ROW_ACC + i] = acc[i]
         row[ROW_BIAS + i] = bias[i]
         row[ROW_BIAS_SD + i] = math.sqrt(max(bias_var[i], 0.0))
-    row[ROW_MAG:ROW_MAG + 3] = quaternion.rotate(frame, quaternion.rotate(quat, mag))
+    row[ROW_MAG:ROW_MAG + 3] = quat_rotate(frame, quat_rotate(quat, mag))
     row[ROW_RELIABILITY] = reliability
     row_int[FLAGS_WORD] = flags + (mag_count << 32)

@@ -13,8 +13,8 @@ import numpy as np
 from imu_fusion.kernels import njit
 
 from imu_fusion.geometry.gravity import gravity_world
-from imu_fusion.geometry import quaternion
-from imu_fusion.geometry.rotation import quat_to_matrix, right_jacobian
+from imu_fusion.geometry.rotation import (
+    quat_exp, quat_multiply, quat_normalize, quat_to_matrix, right_jacobian)
 
 POS, VEL, ATT, GYR_BIAS, ACC_BIAS, CORE = 0, 3, 6, 9, 12, 15
 
@@ -99,8 +99,8 @@ def interval(x, gyr, acc, dt, gravity, spin, decay, layout, f_vel, f_att, x_next
         for j in range(3):
             rate[i] -= start[j, i] * spin[j]
     turn = rate * dt
-    half = quaternion.exp(turn, 0.5)
-    middle_quat = quaternion.multiply(x[6:10], half)
+    half = quat_exp(turn, 0.5)
+    middle_quat = quat_multiply(x[6:10], half)
     half_turn = quat_to_matrix(half)
     middle = _product(start, half_turn)
     g = gravity_world(x[0:3], gravity)
@@ -111,7 +111,7 @@ def interval(x, gyr, acc, dt, gravity, spin, decay, layout, f_vel, f_att, x_next
                           + middle[i, 2] * force[2] + g[i])
         x_next[i] = x[i] + dt * (x[3 + i] + 0.5 * dt * force_world[i])
         x_next[3 + i] = x[3 + i] + dt * force_world[i]
-    x_next[6:10] = quaternion.normalize(quaternion.multiply(middle_quat, half))
+    x_next[6:10] = quat_normalize(quat_multiply(middle_quat, half))
     for i in range(9, len(decay)):
         x_next[i + 1] = decay[i] * x[i + 1]
 

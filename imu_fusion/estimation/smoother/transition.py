@@ -10,14 +10,14 @@ import math
 from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.model import ATT, POS, VEL
-from imu_fusion.geometry import quaternion
+from imu_fusion.geometry.rotation import (
+    quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize)
 
 
 @njit
 def boxplus(x, delta):
     """State x (n + 1,) moved by an error state delta (n,), in place."""
-    x[6:10] = quaternion.normalize(
-        quaternion.multiply(x[6:10], quaternion.exp(delta[ATT:ATT + 3], 1.0)))
+    x[6:10] = quat_normalize(quat_multiply(x[6:10], quat_exp(delta[ATT:ATT + 3])))
     for i in range(6):
         x[i] += delta[i]
     for i in range(9, len(delta)):
@@ -27,8 +27,7 @@ def boxplus(x, delta):
 @njit
 def boxminus(a, b, out):
     """out (n,) with a = b [+] out, for states a, b (n + 1,)."""
-    out[ATT:ATT + 3] = quaternion.log(
-        quaternion.multiply(quaternion.conjugate(b[6:10]), a[6:10]))
+    out[ATT:ATT + 3] = quat_log(quat_multiply(quat_conjugate(b[6:10]), a[6:10]))
     for i in range(6):
         out[i] = a[i] - b[i]
     for i in range(9, len(out)):

@@ -1,0 +1,16 @@
+"""A clean copy of a damaged recording."""
+
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+
+
+def repair(path, directory):
+    """Copy all that can be read of ``path`` into a new, clean recording.
+
+    Returns:
+        dict of topic to number of messages.
+    """
+    with open_bag(path) as reader, BagWriter(directory, typestore=reader.typestore) as writer:
+        for topic, msgtype, log_time, cdr in reader.messages():
+            writer.write(topic, msgtype, cdr, log_time, qos=reader.topics[topic].qos_profiles)
+        return dict(writer.counts)

@@ -1,0 +1,28 @@
+"""results.json beside a recording: what estimators found, as plain numbers by node."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+RESULTS_FILE = "results.json"
+
+
+def write_results(directory: str | Path, found: Mapping[str, Mapping]) -> None:
+    """Write what nodes found; numbers that are not finite become null."""
+    (Path(directory) / RESULTS_FILE).write_text(
+        json.dumps(_plain(found), indent=2, allow_nan=False))
+
+
+def read_results(directory: str | Path) -> dict | None:
+    """What nodes found, None without such a file."""
+    file = Path(directory) / RESULTS_FILE
+    return json.loads(file.read_text()) if file.exists() else None
+
+
+def _plain(value):
+    if isinstance(value, Mapping):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,90 @@
+"""One estimator between topics, as ``process``, the pipeline and the report use it."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from imu_fusion.messages.convert import SampleType
+from imu_fusion.parameters.declare import Parameters
+from imu_fusion.parameters.file import parameters_for
+
+
+def _no_findings(logs: Mapping) -> list[str]:
+    return []
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One estimator, between its topics.
+
+    Attributes:
+        node: name of its node.
+        params: classes of the parameters of the estimate; ``node_params``: of those that concern
+            the node alone, which are read here and not used.
+        inputs: topic to the SampleType that reads it; ``required`` are those without which it
+            cannot run.
+        outputs: topic to message type.
+        process_logs: ``(logs, report, *params)`` yields (topic, stamp, cdr) of the outputs and
+            fills in the StageReport; ``logs`` maps a topic to (log, epochs) of the samples fit for
+            use, without topics that the recording lacks.
+        findings: ``(logs)`` lists in words what looks wrong with whole logs as recorded.
+        configure: ``(stage, params_file)`` is (Stage, parameters), where reading the parameters is
+            not all: topics may depend on them.
+        unusable: why it cannot run, empty if it can.
+    """
+
+    node: str
+    params: tuple[type, ...]
+    node_params: tuple[type[Parameters], ...]
+    inputs: Mapping[str, SampleType]
+    required: tuple[str, ...]
+    outputs: Mapping[str, str]
+    process_logs: Callable[..., Iterable[tuple[str, int, bytes]]]
+    findings: Callable[[Mapping], Sequence[str]] = _no_findings
+    configure: Callable[["Stage", object], tuple["Stage", list]] | None = None
+    unusable: str = ""
+
+    def prepare(self, params_file=None) -> tuple["Stage", list]:
+        """(Stage, parameters) under a parameter file, or None for defaults.
+
+        Raises:
+            ImuFusionError: the parameters, or files that they name, are not usable.
+        """
+        if self.configure is not None:
+            return self.configure(self, params_file)
+        return self, self.read_params(params_file)
+
+    def read_params(self, params_file=None) -> list:
+        """The objects of ``params`` in a parameter file (or None: defaults)."""
+        params = parameters_for(self.params + self.node_params, self.node, params_file)
+        return params[:len(self.params)]
+
+    def input_types(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Message types of the topics that are required, and of those that are not."""
+        types = {topic: kind.layout.msgtype for topic, kind in self.inputs.items()}
+        return ({topic: types[topic] for topic in self.required},
+                {topic: name for topic, name in types.items() if topic not in self.required})
+
+
+@dataclass
+class StageReport:
+    """What one stage did.
+
+    Attributes:
+        node: name of its node; ``params`` the objects that it ran with.
+        used: topic to number of samples taken; ``refused``: to reasons and how many of each.
+        written: topic to number of messages.
+        skipped: why it did not run, empty if it did.
+        summary: a line of text; ``results``: plain numbers of what it found; ``remarks``: texts on
+            what makes them doubtful.
+    """
+
+    node: str
+    params: list
+    used: dict[str, int] = field(default_factory=dict)
+    refused: dict[str, dict[str, int]] = field(default_factory=dict)
+    written: Counter = field(default_factory=Counter)
+    skipped: str = ""
+    summary: str = ""
+    results: dict = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
