@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # A file per process at a time: its tests share fixtures, and a ROS domain of their own.
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-slow test-all bench clean
+.PHONY: demo test test-slow test-all bench docs clean
 
 $(READY): setup.py setup.cfg package.xml
 	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), "imu_fusion needs Python 3.11 to 3.13 (the Jazzy wheels), this is " + sys.version.split()[0] + "; try make PYTHON=python3.12"'
@@ -29,5 +29,8 @@ test-all: $(READY)
 bench: $(READY)
 	$(BIN)/python -m benchmarks
 
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo_out build install log
+	rm -rf $(VENV) demo_out site build install log

@@ -17,8 +17,9 @@ report = ["plotly>=5.15"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
+docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
 test = ["pytest>=7.4", "pytest-xdist>=3.5", "hypothesis>=6", "colcon-common-extensions", *report,
-        *terrain]
+        *terrain, *docs]
 
 nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
          "acceleration_field_estimator", "smoothing_trigger"]
@@ -50,7 +51,7 @@ setup(
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
     extras_require={"ros": ros, "report": report, "terrain": terrain, "peers": peers,
-                    "oracles": oracles, "test": test},
+                    "oracles": oracles, "docs": docs, "test": test},
     entry_points={"console_scripts": [
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],

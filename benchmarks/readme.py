@@ -69,46 +69,47 @@ def _board(method):
     return Figure("acceleration_field_clipped", f"run 1 | {method}", "rms error, rad/s")
 
 
-#: (what was measured, ours, others) with the tables that they come from.
-ROWS = [
-    ("Orientation of a hand-turned sensor, 9 trials of BROAD against an optical reference: RMS, deg",
-     f"{_broad('fusion, causal')} live, {_broad('fusion, smoothed')} smoothed",
-     f"VQF {_broad('VQF')}, OfflineVQF {_broad('OfflineVQF')}, Madgwick {_broad('Madgwick (ahrs)')}, "
-     f"Winkler 2025 as printed {_broad('gyro_mag as printed (Winkler 2025)')}", "orientation_broad"),
-    ("The same, gyroscopes cut off at 300 deg/s (24.3 % of the samples): RMS, deg",
-     f"{_clipped('fusion, causal')} live, {_clipped('fusion, smoothed')} smoothed",
-     f"OfflineVQF {_clipped('OfflineVQF')}", "orientation_clipping"),
-    ("Tilt of a car without GNSS: RMS, deg (share within 3 stated sigma)",
-     "vehicle preset, live {} ({}); defaults {} ({})".format(*(
-         str(_car(estimator, column)) for estimator in ("fusion, orientation_vehicle.yaml, causal",
-                                                        "fusion, causal")
-         for column in ("tilt RMS, deg", "within 3 sigma"))),
-     f"VQF {_car('VQF')}", "orientation_vehicles"),
-    ("Acceleration field, simulated head impact, noise 10: relative error x1e-3",
-     f"{_impact('causal filter')} live, {_impact('smoother')} smoothed",
-     f"AO, Rahaman 2019 {_impact('AO (paper)')}", "acceleration_field_independent"),
-    ("Gyroscope cut off at 1000 deg/s, filled in by 8 accelerometers: RMS on the cut-off axes, rad/s",
-     f"{_board('rigid_body, causal')} live, {_board('rigid_body, smoothed')} smoothed",
-     f"spline {_board('cubic spline through the rest')}", "acceleration_field_clipped"),
-    ("SIMULATED ski jumps, 300: position RMS forward/right/down, m",
-     str(Figure("smoother_jump", "iterated, 300 seeds", "position x/y/z m")),
-     "Fang 2020 in this package, median of 30: "
-     + str(Figure("smoother_jump", "the same, median over seeds", "position x/y/z m")),
-     "smoother_jump"),
-    ("Car, 11 x 15 s without GNSS, against RTK: position RMS, m",
-     str(Figure("smoother_drive", "withheld 11 x 15 s, 3D", "RMS m")), "", "smoother_drive"),
-    ("One orientation step (magnetometer and Imu): us of one core",
-     f"{Figure('orientation_speed', 'fusion, causal', 'batch, us/sample')} in batch, "
-     f"{Figure('orientation_speed', 'fusion, causal', 'single call, us')} alone",
-     f"VQF {Figure('orientation_speed', 'VQF', 'batch, us/sample')}", "orientation_speed"),
-]
+def rows():
+    """List of (what was measured, ours, others, name of the table that holds all of it)."""
+    return [
+        ("Orientation of a hand-turned sensor, 9 trials of BROAD against an optical reference: RMS, deg",
+         f"{_broad('fusion, causal')} live, {_broad('fusion, smoothed')} smoothed",
+         f"VQF {_broad('VQF')}, OfflineVQF {_broad('OfflineVQF')}, Madgwick {_broad('Madgwick (ahrs)')}, "
+         f"Winkler 2025 as printed {_broad('gyro_mag as printed (Winkler 2025)')}", "orientation_broad"),
+        ("The same, gyroscopes cut off at 300 deg/s (24.3 % of the samples): RMS, deg",
+         f"{_clipped('fusion, causal')} live, {_clipped('fusion, smoothed')} smoothed",
+         f"OfflineVQF {_clipped('OfflineVQF')}", "orientation_clipping"),
+        ("Tilt of a car without GNSS: RMS, deg (share within 3 stated sigma)",
+         "vehicle preset, live {} ({}); defaults {} ({})".format(*(
+             str(_car(estimator, column)) for estimator in ("fusion, orientation_vehicle.yaml, causal",
+                                                            "fusion, causal")
+             for column in ("tilt RMS, deg", "within 3 sigma"))),
+         f"VQF {_car('VQF')}", "orientation_vehicles"),
+        ("Acceleration field, simulated head impact, noise 10: relative error x1e-3",
+         f"{_impact('causal filter')} live, {_impact('smoother')} smoothed",
+         f"AO, Rahaman 2019 {_impact('AO (paper)')}", "acceleration_field_independent"),
+        ("Gyroscope cut off at 1000 deg/s, filled in by 8 accelerometers: RMS on the cut-off axes, rad/s",
+         f"{_board('rigid_body, causal')} live, {_board('rigid_body, smoothed')} smoothed",
+         f"spline {_board('cubic spline through the rest')}", "acceleration_field_clipped"),
+        ("SIMULATED ski jumps, 300: position RMS forward/right/down, m",
+         str(Figure("smoother_jump", "iterated, 300 seeds", "position x/y/z m")),
+         "Fang 2020 in this package, median of 30: "
+         + str(Figure("smoother_jump", "the same, median over seeds", "position x/y/z m")),
+         "smoother_jump"),
+        ("Car, 11 x 15 s without GNSS, against RTK: position RMS, m",
+         str(Figure("smoother_drive", "withheld 11 x 15 s, 3D", "RMS m")), "", "smoother_drive"),
+        ("One orientation step (magnetometer and Imu): us of one core",
+         f"{Figure('orientation_speed', 'fusion, causal', 'batch, us/sample')} in batch, "
+         f"{Figure('orientation_speed', 'fusion, causal', 'single call, us')} alone",
+         f"VQF {Figure('orientation_speed', 'VQF', 'batch, us/sample')}", "orientation_speed"),
+    ]
 
 
 def results():
-    """The table of ROWS."""
+    """The table of :func:`rows`."""
     lines = ["| what | this package | others, same data | all of it |", "|---|---|---|---|"]
     lines += [f"| {what} | {ours} | {others} | [table](benchmarks/results/{table}.md) |"
-              for what, ours, others, table in ROWS]
+              for what, ours, others, table in rows()]
     return "\n".join(lines) + "\n"
 
 
