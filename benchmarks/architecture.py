@@ -23,9 +23,9 @@ SWEEPS = 24
 
 
 def rooms():
-    """dict of room (module or folder directly below imu_fusion/) to the first words of its docstring.
+    """dict of room (module or folder directly below imu_fusion/) to what its docstring calls it.
 
-    The words end at the first full stop, colon or semicolon.
+    These are its first words, up to a full stop, colon or semicolon.
     """
     found = {}
     for path in sorted(PACKAGE.iterdir()):
@@ -164,9 +164,8 @@ def svg():
              '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
              'markerHeight="7" orient="auto"><path d="M0 0.5 L8 4 L0 7.5 z" fill="#52606d"/>'
              "</marker></defs>", '<rect width="100%" height="100%" fill="#ffffff"/>']
-    for chain in chains:
-        parts.append(f'<path d="{_curve(chain, x, y)}" fill="none" stroke="#7b8794" '
-                     'stroke-width="1.2" marker-end="url(#tip)"/>')
+    parts += [f'<path d="{_curve(chain, x, y)}" fill="none" stroke="#7b8794" '
+              'stroke-width="1.2" marker-end="url(#tip)"/>' for chain in chains]
     for point in (p for row in rows for p in row if not isinstance(p, tuple)):
         left = x[point] - width(point) / 2
         parts.append(

@@ -58,7 +58,12 @@ def _clipped(estimator):
 
 
 def _car(estimator, column="tilt RMS, deg"):
-    return Figure("orientation_vehicles", f"car, 549 s, no magnetometer | 0.2 | {estimator}", column)
+    return Figure("orientation_vehicles",
+                  f"car, 549 s, no magnetometer | 0.2 | {estimator}", column)
+
+
+def _car_with_share(estimator):
+    return f"{_car(estimator)} ({_car(estimator, 'within 3 sigma')})"
 
 
 def _impact(method):
@@ -72,23 +77,25 @@ def _board(method):
 def rows():
     """List of (what was measured, ours, others, name of the table that holds all of it)."""
     return [
-        ("Orientation of a hand-turned sensor, 9 trials of BROAD against an optical reference: RMS, deg",
+        ("Orientation of a hand-turned sensor, 9 trials of BROAD against an optical reference: "
+         "RMS, deg",
          f"{_broad('fusion, causal')} live, {_broad('fusion, smoothed')} smoothed",
-         f"VQF {_broad('VQF')}, OfflineVQF {_broad('OfflineVQF')}, Madgwick {_broad('Madgwick (ahrs)')}, "
-         f"Winkler 2025 as printed {_broad('gyro_mag as printed (Winkler 2025)')}", "orientation_broad"),
+         f"VQF {_broad('VQF')}, OfflineVQF {_broad('OfflineVQF')}, "
+         f"Madgwick {_broad('Madgwick (ahrs)')}, "
+         f"Winkler 2025 as printed {_broad('gyro_mag as printed (Winkler 2025)')}",
+         "orientation_broad"),
         ("The same, gyroscopes cut off at 300 deg/s (24.3 % of the samples): RMS, deg",
          f"{_clipped('fusion, causal')} live, {_clipped('fusion, smoothed')} smoothed",
          f"OfflineVQF {_clipped('OfflineVQF')}", "orientation_clipping"),
         ("Tilt of a car without GNSS: RMS, deg (share within 3 stated sigma)",
-         "vehicle preset, live {} ({}); defaults {} ({})".format(*(
-             str(_car(estimator, column)) for estimator in ("fusion, orientation_vehicle.yaml, causal",
-                                                            "fusion, causal")
-             for column in ("tilt RMS, deg", "within 3 sigma"))),
+         f"vehicle preset, live {_car_with_share('fusion, orientation_vehicle.yaml, causal')}; "
+         f"defaults {_car_with_share('fusion, causal')}",
          f"VQF {_car('VQF')}", "orientation_vehicles"),
-        ("Acceleration field, simulated head impact, noise 10: relative error x1e-3",
+        ("Acceleration field, SIMULATED head impact, noise 10: relative error x1e-3",
          f"{_impact('causal filter')} live, {_impact('smoother')} smoothed",
          f"AO, Rahaman 2019 {_impact('AO (paper)')}", "acceleration_field_independent"),
-        ("Gyroscope cut off at 1000 deg/s, filled in by 8 accelerometers: RMS on the cut-off axes, rad/s",
+        ("Gyroscope cut off at 1000 deg/s, filled in by 8 accelerometers: RMS on the cut-off "
+         "axes, rad/s",
          f"{_board('rigid_body, causal')} live, {_board('rigid_body, smoothed')} smoothed",
          f"spline {_board('cubic spline through the rest')}", "acceleration_field_clipped"),
         ("SIMULATED ski jumps, 300: position RMS forward/right/down, m",

@@ -45,9 +45,10 @@ def parameters(name):
     parts = [WRITTEN_BY, f"# Parameters of {name}\n", f"{_first_paragraph(node.__doc__)}\n",
              "How they are set: [Parameters](../parameters.md).\n"]
     for cls in node.PARAMETERS:
-        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n", markdown_table(cls) + "\n"]
+        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n",
+                  markdown_table(cls) + "\n"]
     for prefix, cls in PER_SENSOR.get(name, {}).items():
-        parts += [f"## Below {prefix}\n", f"{_first_paragraph(cls.__doc__)}\n",
+        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n",
                   markdown_table(cls).replace("| `", f"| `{prefix}") + "\n"]
     return "\n".join(parts)
 

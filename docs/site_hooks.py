@@ -1,7 +1,7 @@
 """What MkDocs is told beyond mkdocs.yml: pages of the site whose text lies outside of docs/.
 
-CHANGELOG, CONTRIBUTING, the README of bags/ and the tables of the benchmarks keep their places in the repository; links to
-them, which are relative paths there, become links to their pages in the site.
+CHANGELOG, CONTRIBUTING, the README of bags/ and the tables of the benchmarks keep their places in
+the repository; links to them, which are relative paths there, become links to their pages.
 """
 
 import posixpath

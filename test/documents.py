@@ -13,7 +13,7 @@ import yaml
 
 from benchmarks.reference import PER_SENSOR, node_class
 from imu_fusion import cli
-from imu_fusion.demos.demo import DEMOS
+from imu_fusion.demos import DEMOS
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.nodes import NODES
 from imu_fusion.parameters.file import load, parameters_for
@@ -25,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
          *sorted((ROOT / "docs").rglob("*.md"))]
 LANGUAGES = {"bash", "python", "yaml", "text"}
+# In a sentence, so many words behind a program are still a name, no command to be read.
+NAMES_ALONE = {"imu_fusion": 0, "make": 0, "pip": 0, "python": 1, "ros2": 2}
 # Programs of others: only that they exist in this world is known.
 FOREIGN = {"git", "cd", "source", "rosdep", "colcon", "python3", "chromium", "sudo"}
 # Not of a stage: those of the nodes' flow control, of the clock and of recordings in bags/.
@@ -103,14 +105,9 @@ def topics():
     return frozenset(TOPICS).union(*({*stage.inputs, *stage.outputs} for stage in STAGES.values()))
 
 
-@cache
 def services():
-    """Services as node/name, from the sources of the nodes."""
-    found = set()
-    for node in NODES:
-        source = (ROOT / "imu_fusion" / "nodes" / f"{node}.py").read_text()
-        found |= {f"{node}/{name}" for name in re.findall(r"~/(\w+)", source)}
-    return found
+    """Services as node/name."""
+    return {f"{node}/{name}" for node, executable in NODES.items() for name in executable.services}
 
 
 def is_parameter(name, known=None):
@@ -178,7 +175,7 @@ class Checker:
                 self.complain(f"no command 'imu_fusion {name}'")
             return
         if name == "run" and arguments[:1] == ["NODE"]:
-            arguments[0] = NODES[0]
+            arguments[0] = next(iter(NODES))
         try:
             context = cli.cli.commands[name].make_context(name, arguments)
         except click.exceptions.Exit:
@@ -309,9 +306,7 @@ class Checker:
         first, *rest = code.split() or [""]
         if first == "imu_fusion" and len(rest) == 1 and rest[0] in cli.cli.commands:
             pass  # the command's name
-        elif first in ("imu_fusion", "make", "pip") and rest or first == "ros2" and len(rest) > 2:
-            self.command(shlex.split(code))
-        elif code.startswith("python -m "):
+        elif len(rest) > NAMES_ALONE.get(first, len(rest)):
             self.command(shlex.split(code))
         elif re.fullmatch(r"imu_fusion(\.\w+)+(\(\))?", code):
             self.module(code.removesuffix("()"))
@@ -330,6 +325,8 @@ class Checker:
         """`group.name`, and `name: value` or `name:=value` where the name has a dot."""
         match = re.fullmatch(r"([a-z_]+(?:\.[\w*<>]+)+)(?:(?:: |:=).*)?", code)
         groups = {name.split(".")[0] for name in all_parameters() if "." in name}
+        if match and match[1].endswith((".yaml", ".csv", ".html", ".md")):
+            return
         if match and match[1].split(".")[0] in groups and not is_parameter(match[1]):
             self.complain(f"no parameter '{match[1]}'")
         old = re.match(r"(\w+)(?:: |:=)", code)

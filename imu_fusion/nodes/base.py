@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+from imu_fusion.kernels import is_compiling
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
 from imu_fusion.parameters.declare import unknown_parameter
@@ -199,8 +200,13 @@ def run_node(node_class, args=None):
         return _complain(node_class, f"unexpected argument '{own[0]}'; parameters are given as "
                          "--ros-args -p name:=value (see --help)")
     signals = []
-    previous = {number: signal.signal(number, lambda n, frame: signals.append(n))
-                for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def take(number, frame):
+        signals.append(number)
+        if is_compiling():
+            raise KeyboardInterrupt    # numba would go on for a minute
+
+    previous = {number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
@@ -208,6 +214,8 @@ def run_node(node_class, args=None):
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
         _run(node_class, signals, files)
+        return 0
+    except KeyboardInterrupt:
         return 0
     except ImuFusionError as error:
         return _complain(node_class, error)

@@ -127,7 +127,7 @@ def smooth_recording(contents, params_file=None):
         result = smoothing.smooth(params, contents.samples(smoothing.INPUTS))
     except (EstimationError, SampleError) as error:
         return None, f"There is no smoothed trajectory: {error}"
-    surface = load_surface(params.surface) if params.surface else None
+    surface = load_surface(params.surface.file) if params.surface.file else None
     return Smoothed(result, params, surface, contents.log(FIX_TOPIC), contents.log(VELOCITY_TOPIC),
                     int(contents.log(RAW).stamp[0])), None
 

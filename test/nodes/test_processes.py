@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import Imu
 
 from imu_fusion.kernels import NOTICE
-from imu_fusion.nodes.processes import Graph
+from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
@@ -118,17 +118,17 @@ def test_help_lists_the_parameters_and_wrong_arguments_are_refused():
     assert done.returncode == 1 and "unexpected argument 'my.bag'" in done.stderr
 
 
-def test_a_graph_asks_a_node_to_end_that_does_not_by_itself(tmp_path, capsys):
+def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, capsys):
     """A recorder without a session never ends; asked to, it closes its recording. What nodes say
     into their logs while they compile is passed on."""
-    with Graph(tmp_path / "logs") as graph:
-        graph.start("recorder", out=str(tmp_path / "bag"))
+    with NodeProcesses(tmp_path / "logs") as nodes:
+        nodes.start("recorder", out=str(tmp_path / "bag"))
         deadline = time.monotonic() + 30.0
         while not (tmp_path / "bag" / "bag_0.mcap").exists():
             assert time.monotonic() < deadline
             time.sleep(0.05)
         with open(tmp_path / "logs" / "recorder.log", "a") as log:
             log.write(f"[INFO] [recorder]: {NOTICE}\n")
-        assert graph.finish("recorder", 0.5) is False
+        assert nodes.finish("recorder", 0.5) is False
     assert capsys.readouterr().err == NOTICE + "\n"
     assert (tmp_path / "bag" / "metadata.yaml").exists()

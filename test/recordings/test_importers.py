@@ -216,8 +216,8 @@ def test_an_indoor_walk_claims_no_better_position_than_its_fixes(tmp_path):
     """Accuracies of 22 to 670 m that wander, as docs/smoother.md says to declare them."""
     assert convert(at_hand("phone_walk"), tmp_path / "bag")[0] == 0
     (tmp_path / "phone.yaml").write_text(
-        "smoother: {ros__parameters: {gnss_position_error_sd: [22.0, 22.0, 22.0], "
-        "gnss_position_error_tau: 60.0}}\n")
+        "smoother: {ros__parameters: {gnss.position_error_sd: [22.0, 22.0, 22.0], "
+        "gnss.position_error_tau: 60.0}}\n")
     reports, _ = batch.process(tmp_path / "bag", tmp_path / "out", tmp_path / "phone.yaml",
                                without=["orientation_estimator"])
     (report,) = [r for r in reports if r.node == "smoother"]
