@@ -58,5 +58,14 @@ def on_page_markdown(markdown, page, config, files):
 
 def on_post_page(output, page, config):
     """The theme fetches its search for pages opened from a folder from elsewhere; ours is here."""
-    here = posixpath.relpath("file_search.js", posixpath.dirname(page.file.dest_uri) or ".")
+    return _own_search(output, posixpath.dirname(page.file.dest_uri))
+
+
+def on_post_template(output_content, template_name, config):
+    """The same for the page of broken links."""
+    return _own_search(output_content, "")
+
+
+def _own_search(output, folder):
+    here = posixpath.relpath("file_search.js", folder or ".")
     return output.replace("https://unpkg.com/iframe-worker/shim", here)
