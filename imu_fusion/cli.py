@@ -43,7 +43,7 @@ class _Group(click.Group):
 
 
 class _ListingCommand(click.Command):
-    """A command whose help ends with the names that it takes: ``listing``, (title, {name: what})."""
+    """A command whose help ends with names that it takes: ``listing``, (title, {name: what})."""
 
     def __init__(self, *args, listing, **kwargs):
         super().__init__(*args, **kwargs)
@@ -170,8 +170,8 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
 def info(bag, target):
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
     from imu_fusion.recordings.bag_reader import open_bag
-    from imu_fusion.recordings.repair import repair
     from imu_fusion.recordings.inspect import inspect_topics
+    from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
@@ -233,13 +233,13 @@ def convert(source, out, topics, description, remap, overwrite):
     with open_bag(source) as reader:
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
         renamed = {reader.require(other).name: name for other, name in names.items()}
-        with BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer:
-            with click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
-                                   length=sum(reader.topics[t].count for t in kept),
-                                   file=sys.stderr) as messages:
-                for topic, msgtype, log_time, cdr in messages:
-                    writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
-                                 qos=reader.topics[topic].qos_profiles or None)
+        with (BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer,
+              click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
+                                length=sum(reader.topics[t].count for t in kept),
+                                file=sys.stderr) as messages):
+            for topic, msgtype, log_time, cdr in messages:
+                writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
+                             qos=reader.topics[topic].qos_profiles or None)
     click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
 
 
