@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from imu_fusion.geometry.rotation import quat_rotate_inverse, quat_to_matrix, quat_to_rpy
+from imu_fusion.geometry.rotation import (quat_multiply, quat_rotate_inverse, quat_to_matrix,
+                                          quat_to_rpy)
 from imu_fusion.kernels import njit
 
 
@@ -36,4 +37,17 @@ def in_sensor_axes(quat, v):
         out[i, 0] = x
         out[i, 1] = y
         out[i, 2] = z
+    return out
+
+
+@njit
+def turned_by(turn, quat):
+    """``turn * q`` for each row q of (n, 4); turn (4,). Returns (n, 4)."""
+    out = np.empty((len(quat), 4))
+    for i in range(len(quat)):
+        x, y, z, w = quat_multiply(turn, quat[i])
+        out[i, 0] = x
+        out[i, 1] = y
+        out[i, 2] = z
+        out[i, 3] = w
     return out

@@ -64,6 +64,15 @@ def fix_message(stamp, frame_id, latitude_deg, longitude_deg, height, cov_enu=No
                                         _COVARIANCE_KNOWN if known else 0])
 
 
+def fix_messages(stamp, frame_id, values):
+    """CDR bytes of n sensor_msgs/NavSatFix: stamp (n,), values (n, 12) latitude, longitude (degrees),
+    height (m), covariance (m^2) row by row."""
+    full = np.empty((len(stamp), FIX.size))
+    full[:, 0], full[:, 1], full[:, -1] = 0, 1, _COVARIANCE_KNOWN
+    full[:, 2:-1] = values
+    return FIX.encode_block(stamp, frame_id, full)
+
+
 def velocity_message(stamp, frame_id, vel_world, cov_world=None):
     """CDR bytes of a geometry_msgs/TwistWithCovarianceStamped. vel_world: (3,) m/s ENU."""
     cov = np.zeros((6, 6))

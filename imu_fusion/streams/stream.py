@@ -7,8 +7,9 @@ that says. What comes out does not depend on how the samples were cut into block
 DDS to it, batch adds recordings.
 """
 
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -37,6 +38,29 @@ class Messages(NamedTuple):
     cdrs: list[bytes]
 
 
+@dataclass(frozen=True)
+class Conclusion:
+    """What a stream says after the last sample of a whole recording.
+
+    ``made``: further lists of Messages; ``results``: plain numbers; ``summary``: a line of text;
+    ``remarks``: texts on what makes the numbers doubtful.
+    """
+
+    made: Iterable[list[Messages]] = ()
+    results: Mapping[str, Any] = field(default_factory=dict)
+    summary: str = ""
+    remarks: Sequence[str] = ()
+
+
+def one_by_one(made: Iterable[Messages]) -> Iterator[tuple[str, int, bytes]]:
+    """(topic, stamp, cdr) of Messages that belong together, in order of stamps, topics of one stamp
+    in the order given."""
+    made = list(made)
+    rows = [(stamp, k, i) for k, m in enumerate(made) for i, stamp in enumerate(m.stamp.tolist())]
+    for stamp, k, i in sorted(rows):
+        yield made[k].topic, stamp, made[k].cdrs[i]
+
+
 _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
 
 
@@ -50,16 +74,19 @@ class Stream:
     Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement
     ``restart`` (forget everything), ``use`` (samples of one epoch in, Messages out), ``flush``
     (Messages of what is held back), and where they have something to say ``look_at`` (texts about
-    first samples) and ``results``.
+    first samples) and ``conclude``.
     """
 
     same_frame: ClassVar[tuple[str, ...]] = ()
+    #: To be set before the first sample where :meth:`conclude` is to be called: what that needs
+    #: is then kept.
+    concludes = False
 
     def __init__(self, inputs: Mapping[str, SampleType],
                  warn: Callable[[str], object] = lambda text: None) -> None:
         self.inputs = inputs
         self.warn = warn
-        self.bad_messages = 0
+        self.undecodable: Counter[str] = Counter()
         self._merger = BlockMerger({topic: kind.width for topic, kind in inputs.items()},
                                    self._refused)
         self.reset()
@@ -68,6 +95,7 @@ class Stream:
         """Start over: with strict merging of these topics, or live (None)."""
         self._merger.begin(session_topics)
         self.frame_ids: dict[str, str] = {}
+        self.restarts = 0
         self._first: dict[str, list[Samples]] = {topic: [] for topic in self.inputs}
         self.restart()
 
@@ -81,9 +109,10 @@ class Stream:
         samples = {}
         for topic, block in blocks.items():
             for reason in block.refused.values():
-                self.bad_messages += 1
-                if _is_told(self.bad_messages):
-                    self.warn(f"{topic}: message left out: {reason} ({self.bad_messages} so far)")
+                self.undecodable[topic] += 1
+                if _is_told(self.undecodable[topic]) and not self.concludes:
+                    self.warn(f"{topic}: message left out: {reason} "
+                              f"({self.undecodable[topic]} so far)")
             if len(block.stamp):
                 if topic not in self.frame_ids:
                     self.frame_ids[topic] = block.frame_ids[0]
@@ -105,6 +134,13 @@ class Stream:
         """What was taken and refused, by topic."""
         return self._merger.guards
 
+    def refused(self, topic: str) -> dict[str, int]:
+        """What was left out of a topic: reasons in words, and how many of each."""
+        refused = self.guards[topic].refused()
+        if self.undecodable[topic]:
+            refused["cannot be decoded"] = self.undecodable[topic]
+        return refused
+
     @property
     def held(self) -> int:
         """Number of samples that wait for another topic."""
@@ -122,6 +158,10 @@ class Stream:
         """What is held back for samples that will not come."""
         raise NotImplementedError
 
+    def conclude(self) -> Conclusion:
+        """After :meth:`finish`, at the end of a whole recording."""
+        return Conclusion()
+
     def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
         """Texts about the first samples of ``topic``; ``logs`` maps topics to what there is."""
         return []
@@ -132,12 +172,15 @@ class Stream:
             if segment.restart:
                 self.warn("the clock was set back: the estimator starts anew")
                 made += self.flush()
+                self.restarts += 1
                 self.restart()
             made += self.use(segment.samples)
         return made
 
     def _look(self, topic: str, stamp: np.ndarray, values: np.ndarray) -> None:
         """Have the first samples looked at, once there are enough of them."""
+        if self.concludes:
+            return    # whole logs are looked at instead
         first = self._first[topic]
         seen = sum(len(stamps) for stamps, _ in first)
         if seen < _LOOK_AT:
@@ -152,6 +195,8 @@ class Stream:
                 for topic, parts in self._first.items() if parts}
 
     def _refused(self, topic: str, stamps: np.ndarray, verdicts: Sequence[Verdict]) -> None:
+        if self.concludes:
+            return    # told in the end, in a table
         counts = self._merger.guards[topic].counts
         for verdict in dict.fromkeys(verdicts):
             count, here = counts[verdict], verdicts.count(verdict)

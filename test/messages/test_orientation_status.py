@@ -25,12 +25,11 @@ def test_bytes_that_are_no_flags_are_refused():
 def test_a_disturbance_lasts_until_the_next_magnetometer_sample():
     """Imu rows between two magnetometer samples say nothing of the field."""
     rows = [st.FLAG_MAG_USED, st.FLAG_MAG_DISTURBED, 0, st.FLAG_SATURATED, st.FLAG_MAG_USED, 0]
-    got, flags = [], 0
-    for row in rows:
-        flags = lasting_flags(row, flags)
-        got.append(flags)
     d = st.FLAG_MAG_DISTURBED
-    assert got == [0, d, d, d | st.FLAG_SATURATED, 0, 0]
+    expected = [0, d, d, d | st.FLAG_SATURATED, 0, 0]
+    assert lasting_flags(np.array(rows), 0).tolist() == expected
+    for cut in range(1, len(rows)):
+        assert lasting_flags(np.array(rows[cut:]), expected[cut - 1]).tolist() == expected[cut:]
 
 
 def test_bias_and_its_deviation_survive_the_message():
