@@ -87,7 +87,7 @@ def read_estimates(path: str | Path) -> tuple[AttitudeLog | None, Status, list[s
     """(log of imu/data or None, Status, warnings) of a recording."""
     warnings: list[str] = []
     with open_bag(path) as reader:
-        cdrs = {name: [cdr for _, _, _, cdr in reader.messages([find_topic(reader.topics, name)])]
+        cdrs = {name: [cdr for _, _, _, cdr in reader.messages([reader.require(name).name])]
                 for name, msgtype in ((FLAGS_TOPIC, FLAGS_TYPE), (BIAS_TOPIC, TWIST.msgtype))
                 if _has(reader, name, msgtype)}
         status = Status.from_messages(cdrs.get(FLAGS_TOPIC, ()), cdrs.get(BIAS_TOPIC, ()))
@@ -137,7 +137,7 @@ def moving_changes(reader: Reader) -> tuple[np.ndarray, np.ndarray] | None:
     """(stamps, values) of the movement mask's changes, or None."""
     if not _has(reader, MOVING, BOOL_TYPE):
         return None
-    name = find_topic(reader.topics, MOVING)
+    name = reader.require(MOVING).name
     pairs = [(log_time, bool_value(cdr)) for _, _, log_time, cdr in reader.messages([name])]
     stamps, values = zip(*pairs)
     return np.array(stamps), np.array(values)

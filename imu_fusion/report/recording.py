@@ -30,7 +30,7 @@ from imu_fusion.report.contents import (
 from imu_fusion.report.field_data import FieldData, read_field
 from imu_fusion.report.figures import Shade, intervals
 from imu_fusion.report.gnss import gnss_section
-from imu_fusion.report.html import Notes, Numbers, Section, Text, write_report
+from imu_fusion.report.html import Block, Notes, Numbers, Section, Text, write_report
 from imu_fusion.report.orientation import (
     error_section,
     field_section,
@@ -101,7 +101,7 @@ class _Material:
         """(n,) bool, in which errors the sensor was moving."""
         if self.errors is None or self.contents.changes is None:
             return None
-        return moving_at(self.estimate.stamp, *self.contents.changes)
+        return moving_at(self.errors.stamp, *self.contents.changes)
 
     @cached_property
     def shades(self):
@@ -174,7 +174,7 @@ def _summary(material) -> Section:
     else:  # the orientation alone is no longer what counts most
         numbers = key_numbers(contents.duration_s, rate, findings=findings)
         numbers = Numbers((*smoother_numbers(m.smoothed.result), *numbers.items))
-    blocks = [numbers]
+    blocks: list[Block] = [numbers]
     if m.warnings:
         blocks.append(Notes(tuple(m.warnings)))
     if m.estimate is None and m.field is None:
