@@ -144,7 +144,8 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
 
 def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageReport], list[Chosen]]:
     """A report per stage, and the stages that can run."""
-    reports, chosen = [], []
+    reports: list[StageReport] = []
+    chosen: list[Chosen] = []
     for stage in STAGES.values():
         # Left out or not: its parameters are checked.
         stage, params = stage.prepare(params_file)

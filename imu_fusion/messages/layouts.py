@@ -9,7 +9,9 @@ the default middleware; anything else is refused.
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -50,25 +52,26 @@ class Layout:
     the numbers before, the doubles and the numbers after, all as float64.
     """
 
-    def __init__(self, msgtype, before="", after="", child=False, **doubles):
+    def __init__(self, msgtype: str, before: str = "", after: str = "", child: bool = False,
+                 **doubles: int):
         self.msgtype = msgtype
         self.child = child
         self._before, self._after = before, after
         self._count = sum(doubles.values())
-        self._slices = {}
+        self._slices: dict[str, slice] = {}
         position = len(before)
         for name, count in doubles.items():
             self._slices[name] = slice(position, position + count)
             position += count
         self.size = position + len(after)
-        self._prefixes = {}
-        self._records = {}
+        self._prefixes: dict[tuple[str, str], bytes] = {}
+        self._records: dict[tuple[str, int, int], np.dtype] = {}
         self._rest = {order: struct.Struct(f"{order}{self._count}d{after}") for order in "<>"}
 
-    def __getitem__(self, field):
+    def __getitem__(self, field: str) -> slice:
         return self._slices[field]
 
-    def decode(self, cdr):
+    def decode(self, cdr: bytes) -> tuple[int, str, np.ndarray]:
         """Decode one message.
 
         Args:
@@ -89,7 +92,7 @@ class Layout:
                                    f"{nanosec} ns in a message of {len(cdr)} bytes")
             frame_id = bytes(cdr[16:end - 1]).decode("utf-8", "replace")
             end = self._end_of_strings(order, cdr)
-            values = ()
+            values: tuple = ()
             for code in self._before:
                 size = struct.calcsize(code)
                 end = 4 + _align(end - 4, size)
@@ -100,7 +103,8 @@ class Layout:
             raise MessageError(f"{self.msgtype}: {len(cdr)} bytes are too few ({error})") from None
         return sec * NANOSECONDS + nanosec, frame_id, np.array(values, dtype=np.float64)
 
-    def decode_many(self, messages):
+    def decode_many(self, messages: Sequence[bytes]
+                    ) -> tuple[np.ndarray, list[str], np.ndarray]:
         """Decode a list of messages at once.
 
         Returns:
@@ -114,7 +118,7 @@ class Layout:
             raise MessageError(next(iter(block.refused.values())))
         return block.stamp, block.frame_ids, block.values
 
-    def decode_block(self, messages):
+    def decode_block(self, messages: Sequence[bytes]) -> Decoded:
         """Decode what can be decoded: messages alike in one operation of numpy.
 
         Args:
@@ -125,7 +129,7 @@ class Layout:
         """
         n = len(messages)
         block = Decoded(np.zeros(n, np.int64), [""] * n, np.zeros((n, self.size)), {})
-        alike = {}
+        alike: dict[tuple[int, bytes, bytes], list[int]] = {}
         for i, cdr in enumerate(messages):
             alike.setdefault((len(cdr), bytes(cdr[:4]), bytes(cdr[12:16])), []).append(i)
         for indices in alike.values():
@@ -145,7 +149,8 @@ class Layout:
                             block.values[keep], dict(sorted(block.refused.items())))
         return block
 
-    def _decode_alike(self, messages, indices, block):
+    def _decode_alike(self, messages: Sequence[bytes], indices: np.ndarray,
+                      block: Decoded) -> np.ndarray:
         """Decode the messages whose strings are those of the first; return the other indices."""
         first = messages[indices[0]]
         try:
@@ -178,7 +183,8 @@ class Layout:
             block.values[here, last + k] = chosen[f"after{k}"]
         return indices[~same]
 
-    def encode_block(self, stamp, frame_id, values, child_frame_id=""):
+    def encode_block(self, stamp: np.ndarray, frame_id: str, values: np.ndarray,
+                     child_frame_id: str = "") -> list[bytes]:
         """:meth:`encode` of n messages: stamp (n,) int64, values (n, size). Returns a list of
         bytes."""
         n = len(stamp)
@@ -200,7 +206,8 @@ class Layout:
         data = rows.tobytes()
         return [data[i:i + size] for i in range(0, n * size, size)]
 
-    def encode(self, stamp, frame_id, values, child_frame_id=""):
+    def encode(self, stamp: int, frame_id: str, values: Sequence[float] | np.ndarray,
+               child_frame_id: str = "") -> bytes:
         """The CDR bytes of one message (little endian, padding zero).
 
         Args:
@@ -227,7 +234,7 @@ class Layout:
             body = _pad(body, struct.calcsize(code)) + struct.pack("<" + code, int(value))
         return _LITTLE + body
 
-    def _end_of_strings(self, order, cdr):
+    def _end_of_strings(self, order: str, cdr: bytes) -> int:
         """Where the numbers may begin."""
         end = 16 + struct.unpack_from(order + "I", cdr, 12)[0]
         if self.child:
@@ -235,12 +242,13 @@ class Layout:
             end = start + 4 + struct.unpack_from(order + "I", cdr, start)[0]
         return end
 
-    def _record(self, order, end, size):
+    def _record(self, order: str, end: int, size: int) -> np.dtype:
         """The structured dtype of a message of ``size`` bytes whose strings end at ``end``."""
         record = self._records.get((order, end, size))
         if record is not None:
             return record
-        fields = {"sec": (order + "i4", 4), "nanosec": (order + "u4", 8)}
+        fields: dict[str, tuple[Any, int]] = {
+            "sec": (order + "i4", 4), "nanosec": (order + "u4", 8)}
         for part, codes in (("before", self._before), ("doubles", ""), ("after", self._after)):
             if part == "doubles":
                 end = 4 + _align(end - 4, 8)

@@ -5,7 +5,7 @@ has passed its stamp or has ended, so what comes out depends on stamps alone, ne
 on how the samples were cut into blocks. Live, all that has come is released at once.
 """
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,12 @@ from imu_fusion.samples.guard import Guard, Verdict, fit_for_use
 
 Samples = tuple[np.ndarray, np.ndarray]
 """Stamps (n,) int64 ns, ascending, and values (n, k) of one topic."""
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """Samples of one topic that follow each other."""
+    return (np.concatenate([stamp for stamp, _ in parts]),
+            np.concatenate([values for _, values in parts]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +133,8 @@ class _Waiting:
         """Remove and return (stamps, epochs, values) up to ``bound``, both parts inclusive."""
         count = len(self.stamp)
         if bound is not None:
-            first, last = np.searchsorted(self.epochs, bound[0], side="left"), np.searchsorted(
-                self.epochs, bound[0], side="right")
+            first, last = (int(np.searchsorted(self.epochs, bound[0], side=side))
+                           for side in ("left", "right"))
             count = first + int(np.searchsorted(self.stamp[first:last], bound[1], side="right"))
         taken = self.stamp[:count], self.epochs[:count], self.values[:count]
         self.stamp, self.epochs, self.values = (self.stamp[count:], self.epochs[count:],

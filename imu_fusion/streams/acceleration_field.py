@@ -5,21 +5,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
-                                                      AccelerationFieldParams, GyroscopeParams,
-                                                      parse_configuration)
-from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED, field_at
+from imu_fusion.estimation.acceleration_field.estimator import (
+    AccelerationFieldEstimator,
+    AccelerationFieldParams,
+    GyroscopeParams,
+    parse_configuration,
+)
 from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
+from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED, field_at
 from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.parameters.file import node_values
 from imu_fusion.samples import AccelerometerLog, ImuLog
 from imu_fusion.samples.matching import SampleMatcher
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 
 NODE = "acceleration_field_estimator"
 GYROSCOPE_TOPIC = "imu/data_raw"
@@ -231,5 +234,5 @@ def _configure(stage, params_file):
 
 
 # Its topics are those of the accelerometers that a parameter file describes.
-STAGE = Stage(NODE, (FieldConfiguration,), (EstimatorNodeParams,), {}, (), OUTPUTS, AccelerationFieldStream,
-              configure=_configure)
+STAGE = Stage(NODE, (FieldConfiguration,), (EstimatorNodeParams,), {}, (), OUTPUTS,
+              AccelerationFieldStream, configure=_configure)

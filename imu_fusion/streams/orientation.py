@@ -11,17 +11,26 @@ from imu_fusion.estimation.orientation.state import FLAG_STILL, ORIENTATION_DTYP
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.geometry.rotation import quat_exp, quat_rotate
 from imu_fusion.geometry.rotation_arrays import in_sensor_axes, turned_by
-from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_message,
-                                         orientation_messages, rpy_messages)
+from imu_fusion.messages.convert import (
+    GYROSCOPE_FIRST,
+    SAMPLE_TYPES,
+    bool_message,
+    orientation_messages,
+    rpy_messages,
+)
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
-from imu_fusion.messages.orientation_status import (FLAGS_TYPE, bias_message, flags_message,
-                                                    lasting_flags)
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import (Conclusion, EstimatorNodeParams, Messages,
-                                       Stream)
+from imu_fusion.messages.orientation_status import (
+    FLAGS_TYPE,
+    bias_message,
+    flags_message,
+    lasting_flags,
+)
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import ImuLog, MagLog, checks
+from imu_fusion.samples.blocks import joined
 from imu_fusion.sensors.magnetometer_calibration import MagCalibrator
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 
 FIX_TOPIC = "fix"
 MAG_TOPIC = "imu/mag"
@@ -200,8 +209,7 @@ def _take(estimator, stamp, gyr, acc, mag_stamp, mag):
             rows.append(estimator.add_mag(int(mag_stamp[j]), mag[j]))
             j += 1
         rows.append(estimator.add_imu(int(stamp[i]), gyr[i], acc[i]))
-    for k in range(j, len(mag_stamp)):
-        rows.append(estimator.add_mag(int(mag_stamp[k]), mag[k]))
+    rows += [estimator.add_mag(int(mag_stamp[k]), mag[k]) for k in range(j, len(mag_stamp))]
     rows = [part for part in rows if len(part)]
     return rows[0] if len(rows) == 1 else np.concatenate([np.empty(0, ORIENTATION_DTYPE), *rows])
 
@@ -257,8 +265,7 @@ class OrientationStream(Stream):
     def flush(self):
         made = []
         if self._kept:
-            imu, mag = ([np.concatenate(column) for column in zip(*parts)]
-                        for parts in zip(*self._kept))
+            imu, mag = (joined(parts) for parts in zip(*self._kept))
             self._kept = []
             made = self._run(imu, mag)
         return made + self._write(self.estimator.finish())

@@ -16,15 +16,15 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import EstimationError, MessageError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
-from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_messages
-from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
-                                             diagnostics_value)
+from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.declare import param
 from imu_fusion.samples import checks
+from imu_fusion.samples.blocks import Samples, joined
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 from imu_fusion.surfaces.file import load_surface
 
 IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
@@ -105,7 +105,7 @@ class SmootherStream(Stream):
     def restart(self):
         self.dropped = 0
         self.bytes = 0
-        self._collected = {topic: [] for topic in INPUTS}
+        self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
 
     def use(self, samples):
         for topic, (stamp, values) in samples.items():
@@ -141,9 +141,9 @@ class SmootherStream(Stream):
             raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
                                   f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
                                   "raise memory_limit")
-        for topic, parts in self._collected.items():
+        for parts in self._collected.values():
             if len(parts) > 1:    # not again at the next call
-                parts[:] = [tuple(np.concatenate(column) for column in zip(*parts))]
+                parts[:] = [joined(parts)]
         missing = [topic for topic in REQUIRED if not self._collected[topic]]
         if missing:
             raise EstimationError(

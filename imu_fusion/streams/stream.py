@@ -17,7 +17,7 @@ import numpy as np
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.messages.layouts import Decoded
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.samples.blocks import BlockMerger, Samples
+from imu_fusion.samples.blocks import BlockMerger, Samples, joined
 from imu_fusion.samples.guard import Guard, Verdict
 
 
@@ -190,8 +190,7 @@ class Stream:
                     self.warn(text)
 
     def _first_logs(self) -> dict[str, Any]:
-        return {topic: self.inputs[topic].log(
-                    *(np.concatenate(column) for column in zip(*parts)), self.frame_ids[topic])
+        return {topic: self.inputs[topic].log(*joined(parts), self.frame_ids[topic])
                 for topic, parts in self._first.items() if parts}
 
     def _refused(self, topic: str, stamps: np.ndarray, verdicts: Sequence[Verdict]) -> None:

@@ -7,6 +7,7 @@ from imu_fusion.errors import MessageError
 from imu_fusion.estimation.orientation import state as st
 from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
 from imu_fusion.streams import orientation as orientation_stream
+from imu_fusion.streams.stream import one_by_one
 from imu_fusion.messages.orientation_status import (
     WORDS, bias_message, bias_values, flags_message, flags_value, lasting_flags)
 
@@ -49,7 +50,8 @@ def test_flags_come_when_they_change_and_biases_ten_times_a_second():
     rows["flags"][150:300] |= st.FLAG_STILL
     writer = orientation_stream._Writer(orientation_stream.OrientationParams(),
                                         orientation_stream.OrientationOutputParams())
-    messages = list(writer.messages(rows, "imu"))
+    messages = list(one_by_one(writer.messages(rows[:170], "imu")
+                               + writer.messages(rows[170:], "imu")))
     flags = [flags_value(cdr) for topic, _, cdr in messages if topic == "imu/flags"]
     s, r = st.FLAG_SATURATED, st.FLAG_STILL
     assert flags == [(0, 0), (1_000_000_000, s), (1_500_000_000, s | r), (2_000_000_000, r),

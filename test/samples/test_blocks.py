@@ -84,13 +84,19 @@ def test_a_sample_waits_until_every_topic_has_passed_it():
     merger = BlockMerger(TOPICS)
     merger.begin(["imu", "mag"])
     stamp = np.arange(10, dtype=np.int64) * 10
-    block = lambda s: {"imu": (s, s[:, None].astype(float))}
-    assert merger.add(block(stamp)) == [] and merger.held == 10
+    assert merger.add({"imu": (stamp, stamp[:, None].astype(float))}) == [] and merger.held == 10
     (segment,) = merger.add({"mag": (np.array([45]), np.array([[1.0]]))})
     assert segment.samples["imu"][0].tolist() == [0, 10, 20, 30, 40]
     assert segment.samples["mag"][0].tolist() == [45] and not segment.restart
     (segment,) = merger.end(["mag"])
     assert segment.samples["imu"][0].tolist() == [50, 60, 70, 80, 90]
+
+
+def test_topics_outside_the_session_hold_nobody_back():
+    merger = BlockMerger(TOPICS)
+    merger.begin(["imu"])
+    (segment,) = merger.add({"imu": (np.array([5]), np.array([[1.0]]))})
+    assert list(segment.samples) == ["imu"]
 
 
 def test_live_everything_is_released_at_once_and_all_clocks_go_back_together():
