@@ -290,8 +290,9 @@ def test_calibration_answers_as_yaml_and_is_used(graph, recording):
     response = graph.call(node, Trigger, "/orientation_estimator/calibrate_magnetometer")
     assert response.success, response.message
     found = yaml.safe_load(response.message)
-    assert found["mag_offset"] == pytest.approx([1e-5, 0.0, -5e-6], abs=1e-6)
-    assert estimator._stream.estimator.params.mag_offset == tuple(found["mag_offset"])
+    assert found["sensor.mag_offset"] == pytest.approx([1e-5, 0.0, -5e-6], abs=1e-6)
+    assert estimator._stream.estimator.params.sensor.mag_offset == tuple(
+        found["sensor.mag_offset"])
 
 
 def test_gravity_is_removed_when_asked(graph):
@@ -306,8 +307,8 @@ def test_gravity_is_removed_when_asked(graph):
 
 def test_bias_estimation_is_switched_at_run_time_and_method_is_not(graph):
     estimator, _, publish = still(graph)
-    off, = estimator.set_parameters([Parameter("estimate_bias", value=False)])
-    assert off.successful and not estimator._stream.estimator.params.estimate_bias
+    off, = estimator.set_parameters([Parameter("fusion.estimate_bias", value=False)])
+    assert off.successful and not estimator._stream.estimator.params.fusion.estimate_bias
     publish(10)
     other, = estimator.set_parameters([Parameter("method", value="gyro_mag")])
     assert not other.successful
