@@ -16,8 +16,8 @@ import plotly.offline
 
 from imu_fusion import batch
 from imu_fusion.evaluation.orientation_error import moving_at, orientation_errors, statistics
-from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.messages.convert import attitude_log
+from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.figures import time_figure
 from imu_fusion.report.html import Figure

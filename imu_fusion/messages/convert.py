@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import TopicError
 from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
 from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
-from imu_fusion.samples import (AttitudeLog, FixLog, ImuLog, MagLog, PoseLog,
-                                VelocityLog)
+from imu_fusion.samples import AttitudeLog, FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 
 UNKNOWN = np.zeros((3, 3))
 ABSENT = np.zeros((3, 3))

@@ -1,14 +1,18 @@
 """A diagnostic_msgs/DiagnosticArray with one status: stamped words and values."""
 
+from rosbags.typesys.stores.ros2_jazzy import builtin_interfaces__msg__Time as Time
 from rosbags.typesys.stores.ros2_jazzy import (
-    builtin_interfaces__msg__Time as Time,
     diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
+)
+from rosbags.typesys.stores.ros2_jazzy import (
     diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
-    diagnostic_msgs__msg__KeyValue as KeyValue, std_msgs__msg__Header as Header)
+)
+from rosbags.typesys.stores.ros2_jazzy import diagnostic_msgs__msg__KeyValue as KeyValue
+from rosbags.typesys.stores.ros2_jazzy import std_msgs__msg__Header as Header
 
 from imu_fusion.errors import MessageError
-from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.layouts import NANOSECONDS
+from imu_fusion.messages.typestore import TYPES
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 

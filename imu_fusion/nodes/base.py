@@ -10,12 +10,18 @@ import rclpy
 import rclpy.node
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import (
-    FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+from imu_fusion.kernels import is_compiling
+from imu_fusion.nodes import NODES
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
 from imu_fusion.parameters.declare import unknown_parameter
@@ -199,8 +205,13 @@ def run_node(node_class, args=None):
         return _complain(node_class, f"unexpected argument '{own[0]}'; parameters are given as "
                          "--ros-args -p name:=value (see --help)")
     signals = []
-    previous = {number: signal.signal(number, lambda n, frame: signals.append(n))
-                for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def take(number, frame):
+        signals.append(number)
+        if is_compiling():
+            raise KeyboardInterrupt    # numba would go on for a minute
+
+    previous = {number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
@@ -208,6 +219,8 @@ def run_node(node_class, args=None):
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
         _run(node_class, signals, files)
+        return 0
+    except KeyboardInterrupt:
         return 0
     except ImuFusionError as error:
         return _complain(node_class, error)
@@ -251,10 +264,13 @@ def _run(node_class, signals, params_files):
 
 
 def usage(node_class):
-    """The text of --help: what the node does and its parameters."""
+    """The text of --help: what the node does, its services and its parameters."""
     lines = [node_class.__doc__.strip().splitlines()[0], "",
-             f"usage: {node_class.NAME} [--ros-args -p NAME:=VALUE ... -r FROM:=TO ...]", "",
-             "parameters:"]
+             f"usage: {node_class.NAME} [--ros-args -p NAME:=VALUE ... -r FROM:=TO ...]", ""]
+    if node_class.NAME in NODES and NODES[node_class.NAME].services:
+        lines += ["services (std_srvs/Trigger): " + ", ".join(
+            f"~/{service}" for service in NODES[node_class.NAME].services), ""]
+    lines.append("parameters:")
     for cls in node_class.PARAMETERS:
         for info in cls.infos():
             default = "unset" if info.default is None else info.default

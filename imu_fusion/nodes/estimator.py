@@ -5,14 +5,14 @@ from contextlib import ExitStack
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
+from imu_fusion.streams.stream import EstimatorNodeParams
 
 
 class EstimatorNode(Node):
-    """A node around a :class:`imu_fusion.streams.stream.Stream`; also the relay's stage."""
+    """A node around a :class:`imu_fusion.streams.stream.Stream`; also the relay's processor."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
@@ -46,7 +46,7 @@ class EstimatorNode(Node):
         """Values of the estimator for diagnostics; subclasses add theirs."""
         return {}
 
-    # The stage of the relay: see nodes/flow.py.
+    # The processor of the relay: see nodes/flow/relay.py.
 
     def reset(self, topics):
         self._stream.reset([self._names[topic] for topic in topics])

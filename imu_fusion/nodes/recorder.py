@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
-from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.recordings.qos import qos_profile
 from imu_fusion.nodes.base import Node, message_class, run_node
 from imu_fusion.nodes.flow import DEPTH, NEXT, FlowSink, steady_timer
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.qos import qos_profile
 
 
 @dataclass(frozen=True)

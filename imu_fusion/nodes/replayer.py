@@ -11,11 +11,11 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from imu_fusion.errors import ParameterError, TopicError
-from imu_fusion.recordings.bag_reader import find_topic, open_bag
 from imu_fusion.nodes.base import Node, message_class, run_node
 from imu_fusion.nodes.flow import DEPTH, END, NEXT, FlowSource, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.recordings.bag_reader import find_topic, open_bag
 
 _BURST = 50  # messages sent before services and acknowledgements are looked at
 _BLOCKED = 0.05  # s, wait of the executor while nothing may be sent; callbacks end it

@@ -197,7 +197,6 @@ class _RecoveringReader(Reader):
     def __init__(self, path, files, reason):
         super().__init__(path)
         self._files = files
-        self._schemas = {}
         counts, times = Counter(), []
         for topic, _, log_time, _ in self._scan():
             counts[topic] += 1
@@ -211,27 +210,30 @@ class _RecoveringReader(Reader):
                              "copy")
 
     def _scan(self):
+        """Yield (topic, msgtype, log time, CDR bytes) as far as each file can be read: the open
+        chunk at its end is lost."""
         for path in self._files:
-            schemas, channels = {}, {}
             with open(path, "rb") as stream:
                 try:
-                    for record in StreamReader(stream, validate_crcs=True).records:
-                        if isinstance(record, mcap.records.Schema):
-                            schemas[record.id] = record
-                        elif isinstance(record, mcap.records.Channel):
-                            channels[record.id] = self._register(record, schemas)
-                        elif isinstance(record, mcap.records.Message):
-                            topic = channels.get(record.channel_id)
-                            if topic is not None:
-                                yield topic, self.topics[topic].msgtype, record.log_time, record.data
+                    yield from self._scan_file(stream)
                 except (mcap.exceptions.McapError, EOFError, struct.error, ValueError,
-                        RuntimeError) as error:
-                    # The open chunk at the end is lost; what came before has been yielded.
-                    self._broken = error
+                        RuntimeError):
+                    continue
                 except Exception as error:  # decompressors raise types of their own
                     if "zstd" not in repr(type(error)).lower() and "lz4" not in repr(error).lower():
                         raise
-                    self._broken = error
+
+    def _scan_file(self, stream):
+        schemas, channels = {}, {}
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, mcap.records.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, mcap.records.Channel):
+                channels[record.id] = self._register(record, schemas)
+            elif isinstance(record, mcap.records.Message):
+                topic = channels.get(record.channel_id)
+                if topic is not None:
+                    yield topic, self.topics[topic].msgtype, record.log_time, record.data
 
     def _register(self, channel, schemas):
         schema = schemas.get(channel.schema_id)

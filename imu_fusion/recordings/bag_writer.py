@@ -3,6 +3,7 @@
 Goes through ``mcap``, which stores CRCs and keeps log and publish time apart.
 """
 
+import contextlib
 import os
 import shutil
 from collections import Counter
@@ -57,7 +58,7 @@ class BagWriter:
         name = self.directory.resolve().name
         self._file = f"{name}_0.mcap"
         try:
-            self._stream = open(self.directory / self._file, "wb")
+            self._stream = open(self.directory / self._file, "wb")  # noqa: SIM115, closed by close
         except OSError as error:
             raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
         self._position = 0
@@ -167,17 +168,13 @@ class BagWriter:
             raise BagError(f"{self.directory}: closing failed ({error.strerror}); complete "
                            "chunks stay readable") from error
         finally:
-            try:
+            with contextlib.suppress(OSError):  # reported above
                 self._stream.close()
-            except OSError:
-                pass  # reported above
 
     def abandon(self):
         """Close the file as it is, after an error: no index, chunks stay readable."""
-        try:
+        with contextlib.suppress(OSError):
             self._stream.close()
-        except OSError:
-            pass
 
     def _write_metadata(self):
         first = 0 if self._first is None else self._first

@@ -15,16 +15,16 @@ no fix, a speed without direction no velocity, an accuracy that is not logged st
 
 import csv
 import re
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from imu_fusion.errors import SampleError
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
-from imu_fusion.recordings.csv_import import read_number
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, TWIST
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.csv_import import read_number
 
 PHYPHOX_EPOCH = AVANODE_EPOCH = 1_600_000_000_000_000_000
 STANDARD_GRAVITY = 9.80665
@@ -217,7 +217,7 @@ def avanode_gnss(path):
     for k, (line, row) in enumerate(rows):
         fixed = fix_type[k] in _FIX_3D
         try:
-            date = datetime(*map(int, row[utc].split(":")), tzinfo=timezone.utc)
+            date = datetime(*map(int, row[utc].split(":")), tzinfo=UTC)
             stamp = int(date.timestamp()) * NANOSECONDS + round(tow[k] % 1000) * 1_000_000
         except (ValueError, TypeError, IndexError):
             if not fixed:

@@ -7,9 +7,9 @@ import numpy as np
 
 from imu_fusion.errors import MessageError
 from imu_fusion.messages.convert import SAMPLE_TYPES
-from imu_fusion.recordings.logs import read_log
 from imu_fusion.messages.layouts import NANOSECONDS
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 
 _HEADER = "std_msgs/msg/Header"

@@ -20,7 +20,6 @@ import plotly.offline
 import imu_fusion
 from imu_fusion.errors import ImuFusionError
 
-
 # A number with its unit, a dash for none, or nothing: columns of these are set to the right.
 _NUMBER = re.compile(r"^([-+]?\d[\d.,]*(e[-+]?\d+)?( ?\S{1,4})?|–|)$")
 

@@ -9,29 +9,34 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, SampleError, TopicError
 from imu_fusion.evaluation.orientation_error import moving_at, orientation_errors
-from imu_fusion.streams import smoother as smoothing
-from imu_fusion.streams.registry import STAGES
-from imu_fusion.streams.stage import StageReport
-from imu_fusion.recordings.bag_reader import find_topic, open_bag
 from imu_fusion.messages.convert import attitude_log, bool_value
-from imu_fusion.recordings.logs import read_log
-from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
-from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
+from imu_fusion.recordings.bag_reader import find_topic, open_bag
+from imu_fusion.recordings.inspect import inspect_topics
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.acceleration_field import field_sections
 from imu_fusion.report.field_data import read_field
 from imu_fusion.report.figures import Shade, intervals
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import Notes, Numbers, Section, Text, write_report
 from imu_fusion.report.orientation import (
-    error_section, field_section, key_numbers, motion_section, orientation_section)
+    error_section,
+    field_section,
+    key_numbers,
+    motion_section,
+    orientation_section,
+)
 from imu_fusion.report.orientation_status import Status, bias_section
 from imu_fusion.report.orientation_status import shades as status_shades
 from imu_fusion.report.overview import overview_section
 from imu_fusion.report.smoother import Smoothed, smoother_numbers, smoother_sections
 from imu_fusion.samples import seconds
 from imu_fusion.samples.guard import guard_log
+from imu_fusion.streams import smoother as smoothing
+from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
+from imu_fusion.streams.registry import STAGES
+from imu_fusion.streams.stage import StageReport
 from imu_fusion.surfaces.file import load_surface
 
 RAW, MAGNETOMETER, ESTIMATES = "imu/data_raw", "imu/mag", "imu/data"
@@ -127,7 +132,7 @@ def smooth_recording(contents, params_file=None):
         result = smoothing.smooth(params, contents.samples(smoothing.INPUTS))
     except (EstimationError, SampleError) as error:
         return None, f"There is no smoothed trajectory: {error}"
-    surface = load_surface(params.surface) if params.surface else None
+    surface = load_surface(params.surface.file) if params.surface.file else None
     return Smoothed(result, params, surface, contents.log(FIX_TOPIC), contents.log(VELOCITY_TOPIC),
                     int(contents.log(RAW).stamp[0])), None
 

@@ -67,7 +67,7 @@ class Smoothed:
         """Position (m, 3) of the antenna at stamps of fixes, NaN outside of the samples."""
         samples, states = self.result.samples, self.result.states
         lever = states["gnss_lever_arm"][0] if "gnss_lever_arm" in states else \
-            np.tile(self.params.gnss_lever_arm, (len(samples), 1))
+            np.tile(self.params.gnss.lever_arm, (len(samples), 1))
         place = samples["position_world"] + Rotation.from_quat(
             samples["quat_world_imu"]).apply(lever)
         return interpolate(samples["stamp"], place, stamp - self.delay("gnss_time_offset"))
@@ -295,7 +295,7 @@ def _before_after(smoothed):
     fix, difference = fix[inside], difference[inside]
     time = seconds(fix.stamp - smoothed.delay("gnss_time_offset"), smoothed.origin)
     sd = _sd(fix.cov_enu)
-    sd[~np.any(sd, axis=1)] = smoothed.params.fix_sd
+    sd[~np.any(sd, axis=1)] = smoothed.params.gnss.fix_sd
     rows = [(name, number(np.sqrt(np.mean(difference[:, i] ** 2)), 3),
              number(np.median(sd[:, i]), 3), number(np.abs(difference[:, i]).max(), 3))
             for i, name in enumerate(_ENU)]

@@ -28,7 +28,7 @@ _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
 
 
 class Stream:
-    """Messages of several topics to an estimator; a stage of a flow Relay.
+    """Messages of several topics to an estimator, as samples in order of their stamps.
 
     Args:
         inputs: dict of topic to SampleType, in order of rank at equal stamps.
