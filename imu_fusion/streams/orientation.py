@@ -234,7 +234,10 @@ class OrientationStream(Stream):
             CalibrationError: the samples do not determine it.
         """
         calibration = self._calibrator.result()
-        self.params = self.params.replace(**calibration.to_parameters())
+        changes = calibration.to_parameters()
+        if self.params.is_as_printed:
+            del changes["fusion.mag_offset_sd"]    # the printed method knows no such thing
+        self.params = self.params.replace(**changes)
         self.estimator = OrientationEstimator(self.params)
         self.restart()
         return calibration

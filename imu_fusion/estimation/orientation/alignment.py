@@ -194,7 +194,7 @@ def _tilt(chain, acc, at_rest, acc_bias_sd):
     chain: (k, 4) of :func:`_chain`, of the first samples alone where later ones are not to be used.
     """
     used = len(chain)
-    acc_first = _rotate_all(chain, acc[:used])
+    acc_first = _rotate_all(chain, np.ascontiguousarray(acc[:used]))
     up_force = acc_first.mean(axis=0)
     gravity = float(np.linalg.norm(up_force))
     if gravity < _NO_FORCE:

@@ -47,19 +47,14 @@ def push_mag(state, par, stamp, mag):
 
 
 @njit
-def _step(s, p, stamp, sample, row, tape):
-    if p.as_printed:
-        return gyro_mag.step(s, p, stamp, sample, row)
-    return fusion.step(s, p, stamp, sample, row, tape)
-
-
-@njit
 def step_imu(state, par, stamp, sample, rows):
     """One Imu sample: int64 ns, (6,) rate rad/s and specific force m/s^2.
 
     rows: (1,) ORIENTATION_DTYPE, gets the row. Returns 0 if the sample was refused, else 1 or 2.
     """
-    return _step(state[0], par[0], stamp, sample, rows[0], np.empty(0, TAPE))
+    if par[0].as_printed:
+        return gyro_mag.step(state[0], par[0], stamp, sample, rows[0])
+    return fusion.step(state[0], par[0], stamp, sample, rows[0], np.empty(0, TAPE))
 
 
 @cache
@@ -91,7 +86,10 @@ def forward(state, par, stamps, samples, mag_stamps, mags, cursor, rows, tapes):
             mag_queue.push(s, p, mag_stamps[at.mag], mags[at.mag])
             at.mag += 1
         tape = tapes[blocks:blocks + 1]
-        result = _step(s, p, stamps[at.imu], samples[at.imu], rows[at.row], tape)
+        if p.as_printed:
+            result = gyro_mag.step(s, p, stamps[at.imu], samples[at.imu], rows[at.row])
+        else:
+            result = fusion.step(s, p, stamps[at.imu], samples[at.imu], rows[at.row], tape)
         if result > 0:
             at.row += 1
         if result == 2 and len(tape) > 0:
