@@ -89,7 +89,7 @@ def test_bursts_at_the_limit_are_solved_at_once_and_soon():
              for r in (rows, again)]
     # 0.51 to 0.32 rad/s and 8.5 to 4.4 deg (other seeds: by a factor of 0.5 to 0.6, 0.75 to 0.8).
     assert rate[1] < 0.7 * rate[0] and angle[1] < 0.7 * angle[0]
-    # Half of what the causal filter did while it took the excess for a random walk.
+    # Half of what the causal filter did while it took the clipped rate for a random walk.
     assert rate[1] < 0.4 and np.degrees(angle[1]) < 5.5
 
 
