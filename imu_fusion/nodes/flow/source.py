@@ -42,7 +42,7 @@ class FlowPublisher:
         self.topic = publisher.topic_name
         self.sent = 0  # equals the DDS sequence number of the last message
         self.limit = _UNBOUNDED
-        self.outbox = deque()
+        self.outbox: deque = deque()
         self.qos = qos
         self._publisher = publisher
         self._source = source
