@@ -16,7 +16,7 @@ from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
 from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.base import Node
-from imu_fusion.parameters.declare import markdown_table
+from imu_fusion.parameters.declare import fields_of, is_group, markdown_table
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -45,12 +45,26 @@ def parameters(name):
     parts = [WRITTEN_BY, f"# Parameters of {name}\n", f"{_first_paragraph(node.__doc__)}\n",
              "How they are set: [Parameters](../parameters.md).\n"]
     for cls in node.PARAMETERS:
-        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n",
-                  markdown_table(cls) + "\n"]
+        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n", *_tables(cls)]
     for prefix, cls in PER_SENSOR.get(name, {}).items():
         parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n",
                   markdown_table(cls).replace("| `", f"| `{prefix}") + "\n"]
     return "\n".join(parts)
+
+
+def _tables(cls):
+    """The table of the parameters at the top level, and under a heading that of each group."""
+    first, second, *rows = markdown_table(cls).splitlines()
+    groups = {field.name: kind for field, kind in fields_of(cls) if is_group(kind)}
+    parts = []
+    for name in (None, *groups):
+        own = [row for row, info in zip(rows, cls.infos())
+               if (info.name.split(".")[0] if "." in info.name else None) == name]
+        if name and own:
+            parts += [f"### {name}\n", f"{_first_paragraph(groups[name].__doc__)}\n"]
+        if own:
+            parts.append("\n".join([first, second, *own]) + "\n")
+    return parts
 
 
 def _title(cls):

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
-from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.messages import convert
 from imu_fusion.messages.layouts import FIX, IMU, POSE, TWIST
 from imu_fusion.messages.typestore import TYPES
