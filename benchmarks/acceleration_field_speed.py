@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.acceleration_field_cases import METHODS, PARAMS, noisy, paper_sensors
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.params import AccelerometerParams
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 SAMPLES = 5001
@@ -98,8 +98,9 @@ def main():
     samples = rng.normal(0, 0.05, (long, 8, 3)) + [0, 0, 9.80665]
     stamp = np.arange(long) * 16_000_000
     for name, change in METHODS.items():
-        params = PARAMS.replace(sample_rate=62.5, initial__angular_velocity=(0.0, 0.0, 0.0),
-                                gravity=9.80665, **change)
+        params = PARAMS.replace(**{
+            "sample_rate": 62.5, "initial.angular_velocity": (0.0, 0.0, 0.0), "gravity": 9.80665,
+            **change})
         duration = _time(lambda: AccelerationFieldEstimator(params, sensors).run(stamp, samples),
                          1)
         table.append([f"{name}, 8 accelerometers, 600 s at 62.5 Hz: {duration:.1f} s",

@@ -100,6 +100,8 @@ class ParameterInfo:
             refuse("is not a value")
         if not self.is_tuple:
             return self._check_element(value, refuse)
+        if self._may_be_one() and isinstance(value, (int, float)) and not isinstance(value, bool):
+            value = (value,)
         if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
             refuse(f"is not a list of {self.element.__name__}")
         result = tuple(self._check_element(v, refuse) for v in value)
@@ -108,6 +110,10 @@ class ParameterInfo:
             if len(result) not in lengths:
                 refuse(f"has {len(result)} elements")
         return result
+
+    def _may_be_one(self):
+        """Whether a tuple of one stands for all elements: then a plain number does too."""
+        return isinstance(self.length, tuple) and 1 in self.length
 
     def _check_element(self, value, refuse):
         if self.element is bool:
@@ -234,14 +240,12 @@ class Parameters:
                     own[field.name] = kind._made(inner)
                 elif inner:
                     own[field.name] = field.default.replace(**inner)
-            elif field.name.replace("__", ".") in flat:
-                own[field.name] = flat[field.name.replace("__", ".")]
+            elif field.name in flat:
+                own[field.name] = flat[field.name]
         return cls(**own)
 
     def get(self, name):
         """The value of a dotted name."""
-        if hasattr(self, name.replace(".", "__")):
-            return getattr(self, name.replace(".", "__"))
         value = self
         for part in name.split("."):
             value = getattr(value, part)
@@ -257,8 +261,6 @@ class Parameters:
         """A validated copy with changes; names may be dotted: ``replace(**{"sensor.x": 1})``."""
         own, inner = {}, {}
         for name, value in changes.items():
-            if hasattr(self, name.replace(".", "__")):
-                name = name.replace(".", "__")
             first, dot, rest = name.partition(".")
             if dot:
                 inner.setdefault(first, {})[rest] = value
@@ -282,7 +284,7 @@ def is_group(kind):
 
 def _info(field, kind):
     element, is_tuple, optional = split_type(kind)
-    return ParameterInfo(name=field.name.replace("__", "."), kind=kind, element=element, is_tuple=is_tuple,
+    return ParameterInfo(name=field.name, kind=kind, element=element, is_tuple=is_tuple,
                          optional=optional, default=field.default, **field.metadata)
 
 

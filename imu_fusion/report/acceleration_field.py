@@ -94,7 +94,7 @@ def field_picture(data, time, magnitude):
     """
     # Half an event's default length to both sides, but at least as many samples as instants.
     step = np.median(np.diff(time)) if len(time) > 1 else 1.0
-    stride = max(1, int(round(data.config.impact.impact__duration / step / _INSTANTS)))
+    stride = max(1, int(round(data.config.stream.impact.duration / step / _INSTANTS)))
     first = int(np.argmax(magnitude)) - stride * (_INSTANTS // 2)
     first = max(0, min(first, len(time) - 1 - stride * (_INSTANTS - 1)))
     shown = np.arange(first, len(time), stride)[:_INSTANTS]
@@ -201,7 +201,7 @@ def _residuals(data, time):
     table, panels = [], []
     for k, name in enumerate(data.readings):
         residual = data.residuals(name)
-        sensor = data.config.accelerometers[name]
+        sensor = data.accelerometer(name)
         noise = sensor.noise_density * np.sqrt(data.config.field.sample_rate)
         with np.errstate(invalid="ignore"):
             limit = np.inf if sensor.range is None else sensor.range

@@ -25,7 +25,7 @@ def test_a_node_takes_the_parameter_file_of_a_table(tmp_path):
         assert set(config.accelerometers) == {"on", "y", "n", "top"}
         assert config.accelerometers["on"].position == (0.15, 0.0, 0.0)
         assert config.accelerometers["top"].measured_axes == ("x", "y")
-        assert config.gyroscope is not None and config.field.sample_rate == 100.0
+        assert config.field.use_gyro and config.field.sample_rate == 100.0
         node.destroy_node()
     finally:
         rclpy.try_shutdown()
