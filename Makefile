@@ -6,7 +6,10 @@ READY := $(VENV)/.ready
 # A file per process at a time: its tests share fixtures, and a ROS domain of their own.
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-slow test-all bench clean
+# Docstrings: imperative mood, Google sections without underlines, first sentences of two lines.
+PEP257 := --add-ignore D205 D209 D213 D400 D401 D403 D406 D407 D413 D415 D417
+
+.PHONY: demo test test-slow test-all lint bench docs clean kernels
 
 $(READY): setup.py setup.cfg package.xml
 	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), "imu_fusion needs Python 3.11 to 3.13 (the Jazzy wheels), this is " + sys.version.split()[0] + "; try make PYTHON=python3.12"'
@@ -14,20 +17,36 @@ $(READY): setup.py setup.cfg package.xml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,report,peers,test]'
 	touch $@
 
-demo: $(READY)
+# What git pull has changed is compiled before several processes want it at once.
+kernels: $(READY)
+	$(BIN)/imu_fusion compile
+
+demo: kernels
 	$(BIN)/imu_fusion demo --out demo_out
 
-test: $(READY)
+test: kernels
 	$(PYTEST) -m "not slow"
 
-test-slow: $(READY)
+test-slow: kernels
 	$(PYTEST) -m slow
 
-test-all: $(READY)
+test-all: kernels
 	$(PYTEST)
+
+# The ament linters are Debian packages: python3-ament-flake8, -pep257, -xmllint.
+# ament_copyright is not run: the licence is in LICENSE and package.xml, once.
+lint: $(READY)
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	@if command -v ament_flake8 > /dev/null; then set -e -x; ament_flake8 --config setup.cfg imu_fusion launch test; \
+	ament_pep257 imu_fusion launch $(PEP257); ament_xmllint package.xml; \
+	else echo "ament linters: not installed here, left out"; fi
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
 
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo_out build install log
+	rm -rf $(VENV) demo_out site build install log

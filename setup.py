@@ -1,4 +1,5 @@
 from glob import glob
+from runpy import run_path
 
 from setuptools import find_packages, setup
 
@@ -17,22 +18,24 @@ report = ["plotly>=5.15"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
-test = ["pytest>=7.4", "pytest-xdist>=3.5", "hypothesis>=6", "colcon-common-extensions", *report,
-        *terrain]
+docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
+test = ["ruff>=0.6", "mypy>=1.10", "types-PyYAML", "pytest>=7.4", "pytest-xdist>=3.5",
+        "hypothesis>=6", "colcon-common-extensions", *report, *terrain, *docs]
 
-nodes = ["replayer", "recorder", "orientation_estimator", "smoother",
-         "acceleration_field_estimator", "smoothing_trigger"]
+# Read, not imported: nothing of the package is installed yet.
+nodes = run_path(f"{package_name}/nodes/__init__.py")["NODES"]
+version = run_path(f"{package_name}/__init__.py")["__version__"]
 
 setup(
     name=package_name,
-    version="0.1.0",
+    version=version,
     description="Orientation, acceleration fields and trajectories from inertial sensors",
     long_description="ROS 2 Jazzy package for live and replayed inertial sensor fusion.",
     author="imu_fusion maintainers",
     maintainer="imu_fusion maintainers",
     maintainer_email="maintainers@imu-fusion.example.org",
     license="Apache-2.0",
-    python_requires=">=3.10",
+    python_requires=">=3.11",
     packages=find_packages(include=["imu_fusion", "imu_fusion.*"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
@@ -50,11 +53,12 @@ setup(
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
     extras_require={"ros": ros, "report": report, "terrain": terrain, "peers": peers,
-                    "oracles": oracles, "test": test},
+                    "oracles": oracles, "docs": docs, "test": test},
     entry_points={"console_scripts": [
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
     ]},
-    package_data={"imu_fusion.report": ["*.css", "*.js"], "imu_fusion.nodes.flow": ["*.xml"]},
+    package_data={"imu_fusion": ["py.typed"], "imu_fusion.report": ["*.css", "*.js"],
+                  "imu_fusion.nodes.flow": ["*.xml"]},
     zip_safe=False,
 )

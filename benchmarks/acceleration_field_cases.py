@@ -3,11 +3,14 @@
 import numpy as np
 
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams, Initial)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
 from imu_fusion.estimation.acceleration_field.rows import field_at
 from imu_fusion.simulation.noise import ornstein_uhlenbeck
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS)
+from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS
 
 BETA = 1e3  # 1/s, Rahaman 2019, section 4.1.2
 PARAMS = AccelerationFieldParams(

@@ -16,11 +16,11 @@ import numpy as np
 import yaml
 
 from benchmarks.table import write_table
-from imu_fusion.nodes.processes import Graph
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import IMU
+from imu_fusion.nodes.processes import NodeProcesses
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 NODE = "acceleration_field_estimator"
@@ -53,16 +53,16 @@ def play(folder, values, duration):
     preset.write_text(yaml.safe_dump(values))
     names = values[NODE]["ros__parameters"]["accelerometers"]["names"]
     count = write_bag(folder / "bag", names, duration)
-    with Graph(folder / "logs") as graph:
-        graph.start("recorder", out=str(folder / "out"))
-        graph.start(NODE, params_file=preset, qos="reliable")
-        graph.start("replayer", bag=str(folder / "bag"), rate=1.0,
+    with NodeProcesses(folder / "logs") as nodes:
+        nodes.start("recorder", out=str(folder / "out"))
+        nodes.start(NODE, params_file=preset, qos="reliable")
+        nodes.start("replayer", bag=str(folder / "bag"), rate=1.0,
                     wait_for_nodes=("recorder", NODE))
-        process, used = graph._processes[NODE], 0.0
-        while graph._processes["recorder"].poll() is None:
+        process, used = nodes.process(NODE), 0.0
+        while nodes.process("recorder").poll() is None:
             used = cpu_seconds(process) if process.poll() is None else used
             time.sleep(0.1)
-        graph.wait("recorder", 60)
+        nodes.wait("recorder", 60)
     with open_bag(folder / "out") as reader:
         return used, count, reader.topics["/acceleration_field/imu"].count
 

@@ -15,7 +15,13 @@ from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.params import (
-    AccelerationFieldParams, AccelerometerParams, Initial, Iteration, Motion, Sensor)
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+    Iteration,
+    Motion,
+    Sensor,
+)
 
 RATE = 62.5
 LIMIT = np.radians(1000)

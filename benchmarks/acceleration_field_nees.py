@@ -11,8 +11,12 @@ from scipy.stats import chi2
 
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams, Initial, Motion)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+    Motion,
+)
 from imu_fusion.estimation.acceleration_field.start import given_start
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS
 from imu_fusion.simulation.rigid_body_motion import draw_motion, ideal_readings

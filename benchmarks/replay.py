@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_fusion.nodes.processes import Graph
+from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
@@ -41,16 +41,16 @@ def long_recording(path):
     return stamps
 
 
-def run(bag, stamps, out):
+def replay_once(bag, stamps, out):
     """One replay: (messages lost per topic, seconds first to last message, CPU seconds)."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with Graph(logs=out.parent / f"{out.name}_logs") as graph:
-        graph.start("recorder", out=str(out), topics=TOPICS)
-        graph.start("orientation_estimator", qos="reliable")
-        graph.start("replayer", bag=str(bag), rate=0.0, wait_for_subscribers=0,
+    with NodeProcesses(logs=out.parent / f"{out.name}_logs") as nodes:
+        nodes.start("recorder", out=str(out), topics=TOPICS)
+        nodes.start("orientation_estimator", qos="reliable")
+        nodes.start("replayer", bag=str(bag), rate=0.0, wait_for_subscribers=0,
                     wait_for_nodes=("recorder", "orientation_estimator"), wait_timeout=60.0)
-        graph.wait("replayer", 900)
-        graph.wait("recorder", 60)
+        nodes.wait("replayer", 900)
+        nodes.wait("recorder", 60)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     lost = {}
@@ -71,7 +71,7 @@ def main(runs=10):
         stamps = long_recording(folder / "bag")
         for i in range(runs):
             started = time.monotonic()
-            lost, seconds, cpu = run(folder / "bag", stamps, folder / f"out{i}")
+            lost, seconds, cpu = replay_once(folder / "bag", stamps, folder / f"out{i}")
             rows.append((lost, seconds, time.monotonic() - started, cpu, os.getloadavg()[0]))
             print(i + 1, *rows[-1], flush=True)
             shutil.rmtree(folder / f"out{i}")

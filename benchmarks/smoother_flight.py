@@ -13,17 +13,18 @@ from scipy.spatial.transform import Rotation, Slerp
 from benchmarks.data import config, data_path
 from benchmarks.jumps import write
 from imu_fusion.estimation.smoother import Smoother
+from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.estimation.smoother.inputs import even_stamps
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 
 PARAMS = config("px4_plane")
 # Neighbouring fixes repeat each other's errors, and their height repeats more closely.
-WANDERING = PARAMS.replace(gnss_min_interval=0.0, fix_sd=(0.02, 0.02, 0.03))
+WANDERING = PARAMS.replace(**{"gnss.min_interval": 0.0, "gnss.fix_sd": (0.02, 0.02, 0.03)})
 WHITE = PARAMS.replace(
-    gnss_min_interval=0.0, gnss_even_stamps=False, gyro_noise_density=1e-2, acc_noise_density=0.2,
-    fix_sd=(1.0, 1.0, 1.5), gnss_position_error_sd=(0.0, 0.0, 0.0), velocity_sd=(0.3, 0.3, 0.5),
-    gnss_velocity_error_sd=(0.0, 0.0, 0.0))
+    sensor=PARAMS.sensor.replace(gyro_noise_density=1e-2, acc_noise_density=0.2),
+    gnss=Gnss(fix_sd=(1.0, 1.0, 1.5), velocity_sd=(0.3, 0.3, 0.5),
+              time_offset_sd=PARAMS.gnss.time_offset_sd))
 # The plane is thrown after some 15 s.
 LAGS, FLYING = 10, 20.0
 
@@ -192,7 +193,7 @@ def main():
              "|---|---|---|---|---|---|---|---|---|"]
     for name, params, log, first in (
             ("white errors, stamps as logged", WHITE, None, 0),
-            ("white errors, even stamps", WHITE.replace(gnss_even_stamps=True), None, 0),
+            ("white errors, even stamps", WHITE.replace(**{"gnss.even_stamps": True}), None, 0),
             ("wandering errors, even stamps", WANDERING, None, 0),
             ("the same, every second fix", PARAMS, None, 0),
             ("the same, beginning with the second", PARAMS, None, 1),

@@ -10,15 +10,17 @@ from benchmarks.data import config, data_path
 from benchmarks.jumps import write
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother
+from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.streams.smoother import SurfaceFile
 from imu_fusion.surfaces.file import load_surface
 
 # A site is flat to 0.3 m over its length, not anew every 10 ms: some seconds of driving.
 FLAT = config("husky")
 # Fixes wander by metres over minutes and scatter by some 0.3 m from one to the next.
-WANDER = FLAT.replace(surface="", surface_interval=0.01)
-BASE = WANDER.replace(fix_sd=(3.0, 3.0, 5.0), gnss_position_error_sd=(0.0, 0.0, 0.0))
+WANDER = FLAT.replace(surface=SurfaceFile())
+BASE = WANDER.replace(gnss=Gnss(covariances=FLAT.gnss.covariances))
 
 
 def main():
@@ -29,7 +31,7 @@ def main():
     with open_bag(path) as reader:
         imu, fix = read_log(reader, "/imu/data"), read_log(reader, "/fix")
     valid = np.flatnonzero(fix.status >= 0)
-    plane = load_surface(FLAT.surface)
+    plane = load_surface(FLAT.surface.file)
     lines = [f"Husky (cra-ros-pkg/robot_localization, BSD): {len(imu)} Imu samples, {len(valid)} "
              f"fixes, whose height spans {np.ptp(fix.height[valid]):.0f} m.", "",
              "| | iterations | height of the trajectory, span m | vertical sd m, median | RMS of "

@@ -50,7 +50,8 @@ def main():
                  "0.021/0.026/0.023 | 0.584/0.319/0.759 | - | - | 1 |")
     turned = monte_carlo(SkiJump(hill, JumpParams(mount=TURNED)), range(100), params, hill)
     square = monte_carlo(jump, range(PAPER_SEEDS),
-                         params.replace(fix_loss_scale=0.0, mag_loss_scale=0.0), hill)
+                         params.replace(**{"gnss.loss": "squared", "mag.loss": "squared"}),
+                         hill)
     lines += ["", "The paper's method starts from one magnetometer and one accelerometer sample "
               "and passes once: seeds that start tens of degrees off stay off, hence the median.",
               "", "Attitude: the heading is what these sensors know least, and in which of the "

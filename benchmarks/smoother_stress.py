@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.jumps import HEADER, monte_carlo, moved, write
 from imu_fusion.estimation.smoother.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
@@ -69,28 +70,28 @@ def main():
     outliers = GnssErrors(outlier_share=0.08)
     row("8 % GNSS outliers", gnss=outliers)
     row("8 % GNSS outliers, squared loss", gnss=outliers,
-        params=base.replace(fix_loss_scale=0.0, mag_loss_scale=0.0))
+        params=base.replace(**{"gnss.loss": "squared", "mag.loss": "squared"}))
     late = GnssErrors(time_offset=0.1)
     row("GNSS 100 ms late, no state", gnss=late)
-    with_offset = base.replace(gnss_time_offset_sd=0.2)
+    with_offset = base.replace(**{"gnss.time_offset_sd": 0.2})
     row("GNSS 100 ms late, state", gnss=late, params=with_offset)
     wander = GnssErrors(position_tau=30.0)
     row("95 % Gauss-Markov GNSS error, white model", gnss=wander)
-    states = base.replace(gnss_position_error_sd=tuple(np.sqrt(0.95) * TOTAL_SD),
-                          gnss_position_error_tau=30.0)
+    states = base.replace(gnss=Gnss(position_error_sd=tuple(np.sqrt(0.95) * TOTAL_SD),
+                                    position_error_tau=30.0))
     row("95 % Gauss-Markov GNSS error, states", gnss=wander, params=states)
     row("the same, no hill", gnss=wander, params=states, surface=None)
     filtered = GnssErrors(velocity_tau=1.0)
     row("95 % Gauss-Markov GNSS velocity error, white model", gnss=filtered)
-    sd_velocity = np.array(base.velocity_sd)
-    states = base.replace(gnss_velocity_error_sd=tuple(np.sqrt(0.95) * sd_velocity),
-                          gnss_velocity_error_tau=1.0)
+    sd_velocity = np.array(base.gnss.velocity_sd)
+    states = base.replace(gnss=Gnss(velocity_error_sd=tuple(np.sqrt(0.95) * sd_velocity),
+                                    velocity_error_tau=1.0))
     row("95 % Gauss-Markov GNSS velocity error, states", gnss=filtered, params=states)
     row("that, no hill", gnss=filtered, params=states, surface=None)
     row("events given 0.15 s early", events=shifted(-0.15))
     row("events given 0.15 s late", events=shifted(0.15))
     row("gyroscope clipped at 2.5 rad/s", phone=PhoneErrors(gyr_range=2.5),
-        params=base.replace(gyro_range=2.5))
+        params=base.replace(**{"sensor.gyro_range": (2.5,)}))
     start = jump.t_takeoff + 1.0
     row("no Imu for 0.5 s in flight", change=without_imu(start, start + 0.5))
     row("no GNSS for 1 s in flight", outages=((start, start + 1.0),))
@@ -98,7 +99,7 @@ def main():
     low = moved(hill, up=-1.0)
     row("sensor 1 m above the surface, no state", surface=low)
     row("sensor 1 m above the surface, state", surface=low,
-        params=base.replace(body_height_sd=1.0))
+        params=base.replace(**{"surface.body_height_sd": 1.0}))
     for name, x in (("oberstdorf_hs137", -85.0), ("zakopane_hs140", -85.0),
                     ("engelberg_hs140", -85.0)):
         row(name, jump=SkiJump(load_surface(name), JumpParams(start_x=x)))
@@ -109,7 +110,7 @@ def main():
         k = np.sqrt(rate / 100.0)
         phone = PhoneErrors()
         row(f"sensors at {rate:.0f} Hz, the same noise densities", params=base.replace(
-            mag_sd=k * base.mag_sd), phone=phone.replace(
+            **{"sensor.mag_noise_sd": k * base.sensor.mag_noise_sd}), phone=phone.replace(
                 rate=rate, **{sd: k * getattr(phone, sd) for sd in ("gyr_sd", "acc_sd", "mag_sd")}))
     south = dataclasses.replace(hill, origin=LocalFrame(-36.9, 147.3, 1600.0), azimuth_deg=40.0)
     row("southern hemisphere", jump=SkiJump(south))

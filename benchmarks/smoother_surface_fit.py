@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from benchmarks.jumps import moved, score, write
-from imu_fusion.demos.trajectory import shared
+from imu_fusion.demos.data import data_folder
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.simulation.jump_sensors import record
@@ -20,7 +20,7 @@ NAME = "oberstdorf_hs106"
 
 def main():
     hill = load_surface(NAME)
-    certificate = yaml.safe_load((shared("config") / "surfaces" / f"{NAME}.yaml").read_text())
+    certificate = yaml.safe_load((data_folder("config") / "surfaces" / f"{NAME}.yaml").read_text())
 
     def built(**changes):
         return surface_from_mapping({**certificate, **changes})

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 import imu_fusion
+from imu_fusion.demos import DEMOS
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.nodes import NODES
 
@@ -29,6 +30,8 @@ class _Group(click.Group):
         except ImuFusionError as error:
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
+        except KeyboardInterrupt:
+            ctx.exit(130)
         except ModuleNotFoundError as error:
             extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
             if extra is None:
@@ -37,6 +40,28 @@ class _Group(click.Group):
                        + (", or source an installed ROS 2 Jazzy" if extra == "ros" else ""),
                        err=True)
             ctx.exit(1)
+
+
+class _ListingCommand(click.Command):
+    """A command whose help ends with names that it takes: ``listing``, (title, {name: what})."""
+
+    def __init__(self, *args, listing, **kwargs):
+        super().__init__(*args, **kwargs)
+        self._title, self._entries = listing
+
+    def format_epilog(self, ctx, formatter):
+        with formatter.section(self._title):
+            formatter.write_dl(list(self._entries.items()))
+
+
+class _NodeCommand(_ListingCommand):
+    """``--help`` ahead of a node's name is ours, behind it the node's."""
+
+    def parse_args(self, ctx, args):
+        if args[:1] in (["--help"], ["-h"]):
+            click.echo(ctx.get_help())
+            ctx.exit()
+        return super().parse_args(ctx, args)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -59,16 +84,24 @@ def _remaps(values):
 
 remap_option = click.option("--remap", multiple=True, metavar="TOPIC:=OTHER",
                             help="Use topic OTHER of the recording for TOPIC. Repeatable.")
+params_file_option = click.option("--params-file", type=click.Path(),
+                                  help="ROS 2 parameter file, keyed by node name.")
+without_option = click.option("--without", multiple=True, metavar="NODE",
+                              help="Leave an estimator out. Repeatable.")
 overwrite_option = click.option("--overwrite", is_flag=True,
                                 help="Replace OUT if it is a recording.")
 
 
-@cli.command(context_settings=PASS_ON, add_help_option=False,
-             short_help="Start one node.")
-@click.argument("node", type=click.Choice(NODES))
+@cli.command("run", cls=_NodeCommand, context_settings=PASS_ON, add_help_option=False,
+             short_help="Start one node.",
+             listing=("Nodes", {name: node.summary for name, node in NODES.items()}))
+@click.argument("node", type=click.Choice(list(NODES)), metavar="NODE")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
-def run(node, arguments):
-    """Start NODE as `ros2 run imu_fusion NODE` would; ARGUMENTS go to it (--ros-args ...)."""
+def start_node(node, arguments):
+    """Start NODE as `ros2 run imu_fusion NODE` would; ARGUMENTS go to it.
+
+    Such as --ros-args -p NAME:=VALUE -r FROM:=TO, or --help for its parameters.
+    """
     main_function = importlib.import_module(f"imu_fusion.nodes.{node}").main
     sys.exit(main_function(list(arguments)))
 
@@ -76,8 +109,8 @@ def run(node, arguments):
 @cli.command()
 @click.argument("bag", type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
-@click.option("--without", multiple=True, metavar="NODE", help="Leave an estimator out. Repeatable.")
+@params_file_option
+@without_option
 @remap_option
 @overwrite_option
 def process(bag, out, params_file, without, remap, overwrite):
@@ -108,8 +141,8 @@ def process(bag, out, params_file, without, remap, overwrite):
 @cli.command()
 @click.argument("bag", type=click.Path())
 @click.argument("out", type=click.Path())
-@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
-@click.option("--without", multiple=True, metavar="NODE", help="Leave an estimator out. Repeatable.")
+@params_file_option
+@without_option
 @click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
 @remap_option
 @overwrite_option
@@ -119,8 +152,8 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
     Each node is a process of an own ROS domain. OUT holds what was played and the estimates,
     the same as those of `process`.
     """
-    from imu_fusion.nodes import pipeline as nodes
-    nodes.run(bag, out, params_file, without, _remaps(remap), overwrite)
+    from imu_fusion.nodes.pipeline import run_pipeline
+    run_pipeline(bag, out, params_file, without, _remaps(remap), overwrite)
     click.echo(f"written: {out}")
     if with_report:
         from imu_fusion.report.recording import write_recording_report
@@ -137,8 +170,8 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
 def info(bag, target):
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
     from imu_fusion.recordings.bag_reader import open_bag
-    from imu_fusion.recordings.repair import repair
     from imu_fusion.recordings.inspect import inspect_topics
+    from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
@@ -200,13 +233,13 @@ def convert(source, out, topics, description, remap, overwrite):
     with open_bag(source) as reader:
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
         renamed = {reader.require(other).name: name for other, name in names.items()}
-        with BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer:
-            with click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
-                                   length=sum(reader.topics[t].count for t in kept),
-                                   file=sys.stderr) as messages:
-                for topic, msgtype, log_time, cdr in messages:
-                    writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
-                                 qos=reader.topics[topic].qos_profiles or None)
+        with (BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer,
+              click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
+                                length=sum(reader.topics[t].count or 0 for t in kept),
+                                file=sys.stderr) as messages):
+            for topic, msgtype, log_time, cdr in messages:
+                writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
+                             qos=reader.topics[topic].qos_profiles or None)
     click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
 
 
@@ -260,7 +293,7 @@ def _ros_args(**values):
 @click.argument("bag", type=click.Path())
 @click.option("--estimates", type=click.Path(),
               help="Recording with imu/data or acceleration_field/*, if not in BAG.")
-@click.option("--params-file", type=click.Path(), help="ROS 2 parameter file, keyed by node name.")
+@params_file_option
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
 def report(bag, estimates, params_file, out):
     """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
@@ -275,18 +308,21 @@ def report(bag, estimates, params_file, out):
     click.echo(f"written: {out}")
 
 
-@cli.command()
+@cli.command(cls=_ListingCommand, listing=("Demos", DEMOS))
 @click.argument("name", default="orientation")
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,
               help="Directory for recording and report.")
 def demo(name, out):
-    """Play a recording through the nodes, record, compare with the truth, report.
+    """Play a recording through the nodes, record, compare with the truth, report."""
+    from imu_fusion.demos import run_demo
+    run_demo(name, out, console)
 
-    NAME: orientation (a sensor turned by hand), drive (a car, GNSS withheld for a while) or
-    jump (a simulated ski jump).
-    """
-    from imu_fusion.demos import demo as demos
-    demos.run(name, out, console)
+
+@cli.command()
+def compile():
+    """Compile the kernels for this machine now, so that no node does when it starts."""
+    from imu_fusion.compile_ahead import compile_ahead
+    compile_ahead(lambda text: click.echo(text, err=True))
 
 
 def main():

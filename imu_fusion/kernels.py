@@ -26,6 +26,7 @@ from pathlib import Path
 import numba
 from numba.core import compiler, event, serialize
 from numba.core.caching import _Cache
+from numba.core.registry import cpu_target
 
 NOTICE = "compiling for this machine: about a minute, once after an installation"
 
@@ -41,8 +42,17 @@ def njit(function: Callable) -> Callable:
     dispatcher = numba.njit(fastmath=False)(function)
     directory = _directory(Path(function.__code__.co_filename))
     if directory is not None:
-        dispatcher._cache = _KernelCache(function, directory)
+        dispatcher._cache = _KernelCache(function, directory)  # type: ignore[attr-defined]
     return dispatcher
+
+
+def entry_point(kernel: Callable, *arguments: object) -> Callable:
+    """The compiled function itself, for arguments of the types of these.
+
+    A call of a kernel looks its arguments' types up, which costs 3 us where some are structured
+    arrays; a call of what this returns does not. It takes arguments of just these types.
+    """
+    return kernel.compile(tuple(numba.typeof(argument) for argument in arguments))
 
 
 @contextmanager
@@ -66,6 +76,27 @@ class _Listener(event.Listener):
 
     def on_end(self, event):
         pass
+
+
+class _Nesting(event.Listener):
+    """How many compilations, one within the other, are going on in this process."""
+
+    depth = 0
+
+    def on_start(self, event):
+        self.depth += 1
+
+    def on_end(self, event):
+        self.depth -= 1
+
+
+_nesting = _Nesting()
+event.register("numba:compile", _nesting)
+
+
+def is_compiling() -> bool:
+    """Whether numba is at work: a handler of signals that waits for its end would seem deaf."""
+    return _nesting.depth > 0
 
 
 class _KernelCache(_Cache):
@@ -128,8 +159,22 @@ def _directory(file: Path) -> Path | None:
         return None    # typed in, or somebody else's
     sources = b"".join(str(f.relative_to(_PACKAGE.parent)).encode() + _digest(f)
                        for f in sorted(sources_of(file)))
-    versions = f"{numba.__version__} {sys.version} ".encode()
-    name = f"{file.stem}-{hashlib.sha256(versions + sources).hexdigest()[:24]}"
+    digest = hashlib.sha256(versions().encode() + sources).hexdigest()
+    return cache_file(f"{file.stem}-{digest[:24]}")
+
+
+def versions() -> str:
+    """What compiled code depends on beside sources and processor."""
+    return f"{numba.__version__} {sys.version} "
+
+
+def processor() -> str:
+    """The processor that numba compiles for."""
+    return repr(cpu_target.target_context.codegen().magic_tuple())
+
+
+def cache_file(name: str) -> Path | None:
+    """A path in the cache, None where there is none."""
     root = _root(os.environ.get("NUMBA_CACHE_DIR"))
     return None if root is None else root / name
 
@@ -195,4 +240,3 @@ def _read(file: Path) -> bytes:
 @cache
 def _digest(file: Path) -> bytes:
     return hashlib.sha256(_read(file)).digest()
-

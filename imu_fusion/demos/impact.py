@@ -1,32 +1,35 @@
 """The demo of the acceleration field: eight accelerometers fill in clipped gyroscopes."""
 
+from pathlib import Path
+
 import numpy as np
 import yaml
+from rich.console import Console
 from rich.table import Table
 
 from imu_fusion.batch import process
-from imu_fusion.demos.trajectory import shared
-from imu_fusion.nodes.processes import Graph
+from imu_fusion.demos.data import data_folder
+from imu_fusion.nodes.processes import NodeProcesses
+from imu_fusion.parameters.file import load
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.parameters.file import load
 from imu_fusion.report.recording import write_recording_report
 
 # rad/s; from about here on some of the eight gyroscopes of the board clip themselves.
 _MIMU_RANGE = 34.0
 
 
-def impact(out, console):
+def show(out: Path, console: Console) -> None:
     """Recover a gyroscope that clips at 1000 deg/s by eight accelerometers (mimu4444)."""
-    bag, preset = shared("bags") / "mimu4444", shared("config") / "mimu4444.yaml"
+    bag, preset = data_folder("bags") / "mimu4444", data_folder("config") / "mimu4444.yaml"
     recording, smoothed = out / "recording", out / "smoothed"
-    with Graph(out / "logs") as graph:
-        graph.start("recorder", out=str(recording), overwrite=True)
-        graph.start("acceleration_field_estimator", params_file=preset, qos="reliable")
-        graph.start("replayer", show=True, bag=str(bag), rate=0.0,
+    with NodeProcesses(out / "logs") as nodes:
+        nodes.start("recorder", out=str(recording), overwrite=True)
+        nodes.start("acceleration_field_estimator", params_file=preset, qos="reliable")
+        nodes.start("replayer", show=True, bag=str(bag), rate=0.0,
                     wait_for_nodes=("recorder", "acceleration_field_estimator"))
-        graph.wait("replayer", 300)
-        graph.finish("recorder", 30.0)
+        nodes.wait("replayer", 300)
+        nodes.finish("recorder", 30.0)
     values = load(preset)["acceleration_field_estimator"]
     (limit,) = values["sensor"]["gyro_range"]
     preset_smoothed = out / "smoothed.yaml"

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def nees(error, cov):
+def nees(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """Normalised estimation error squared: ``e' P^-1 e`` of each sample.
 
     Args:

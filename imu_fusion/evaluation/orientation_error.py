@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import SampleError
+from imu_fusion.samples.logs import PoseLog
 
 # Share of a Gaussian within 1, 2 and 3 standard deviations.
 GAUSSIAN_SHARES = (0.682689, 0.954500, 0.997300)
@@ -38,7 +39,7 @@ class OrientationErrors:
     inclination: np.ndarray
     nees: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.stamp)
 
 
@@ -54,7 +55,8 @@ class ErrorStatistics:
     maximum_deg: float
 
 
-def quaternions_at(stamp, reference_stamp, reference_quat, max_gap=None):
+def quaternions_at(stamp: np.ndarray, reference_stamp: np.ndarray, reference_quat: np.ndarray,
+                   max_gap: int | None = None) -> np.ndarray:
     """Reference orientations at other stamps, along the shortest rotation between neighbours.
 
     Args:
@@ -96,7 +98,8 @@ def quaternions_at(stamp, reference_stamp, reference_quat, max_gap=None):
     return result / np.linalg.norm(result, axis=1, keepdims=True)
 
 
-def moving_at(stamp, change_stamp, moving, before=False):
+def moving_at(stamp: np.ndarray, change_stamp: np.ndarray, moving: np.ndarray,
+              before: bool = False) -> np.ndarray:
     """A movement mask from its changes: each value holds until the next one.
 
     Args:
@@ -113,7 +116,9 @@ def moving_at(stamp, change_stamp, moving, before=False):
                                 side="right")]
 
 
-def orientation_errors(stamp, quat_world_imu, reference, cov_attitude=None, max_gap=None):
+def orientation_errors(stamp: np.ndarray, quat_world_imu: np.ndarray, reference: PoseLog,
+                       cov_attitude: np.ndarray | None = None,
+                       max_gap: int | None = None) -> OrientationErrors:
     """Errors of estimated orientations against a reference.
 
     Args:
@@ -160,7 +165,7 @@ def orientation_errors(stamp, quat_world_imu, reference, cov_attitude=None, max_
                              inclination=angles[:, 2], nees=nees)
 
 
-def attitude_cov_world(quat_world_imu, cov_attitude):
+def attitude_cov_world(quat_world_imu: np.ndarray, cov_attitude: np.ndarray) -> np.ndarray:
     """Attitude covariances about the axes of the world, NaN where they are unknown.
 
     The error in the world is minus the local one, turned by the estimate: same covariance,
@@ -180,7 +185,7 @@ def attitude_cov_world(quat_world_imu, cov_attitude):
     return cov_world
 
 
-def split_angles(quat_error_world):
+def split_angles(quat_error_world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Total, heading and inclination angle of error quaternions (n, 4) xyzw.
 
     Returns:
@@ -193,7 +198,7 @@ def split_angles(quat_error_world):
     return total, heading, inclination
 
 
-def statistics(errors, mask=None):
+def statistics(errors: OrientationErrors, mask: np.ndarray | None = None) -> list[ErrorStatistics]:
     """ErrorStatistics of total, heading and inclination over the samples with a reference.
 
     Args:
@@ -215,7 +220,8 @@ def statistics(errors, mask=None):
     return rows
 
 
-def shares_within(errors, mask=None):
+def shares_within(errors: OrientationErrors,
+                  mask: np.ndarray | None = None) -> dict[str, tuple[float, ...]]:
     """Shares of the errors within 1, 2 and 3 stated standard deviations.
 
     Args:
@@ -238,7 +244,7 @@ def shares_within(errors, mask=None):
     return result
 
 
-def _positive_definite(matrices):
+def _positive_definite(matrices: np.ndarray) -> np.ndarray:
     """Which of (n, 3, 3) symmetric matrices are finite and positive definite: (n,) bool."""
     finite = np.isfinite(matrices).all(axis=(1, 2))
     minors = [matrices[:, 0, 0],

@@ -5,10 +5,12 @@
 Each node is a process of an own ROS domain. The estimates are those of ``batch.process``.
 """
 
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from imu_fusion.errors import TopicError
-from imu_fusion.nodes.processes import Graph
+from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.results import write_results
@@ -19,8 +21,65 @@ SMOOTHER = "smoother"
 _PATIENCE = 3600.0  # s; the nodes notice by themselves when nothing can come any more
 
 
-def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, logs=None,
-        show=True):
+@dataclass(frozen=True)
+class Plan:
+    """What a pipeline does with a recording.
+
+    Attributes:
+        estimators: names of the nodes that have work to do, the smoother among them.
+        renamed: topics of the recording that are played under names of ours.
+        outdated: topics of the recording with earlier estimates, which are not played.
+    """
+
+    estimators: tuple[str, ...]
+    renamed: Mapping[str, str]
+    outdated: tuple[str, ...]
+
+    def replay_parameters(self, bag: str | Path) -> dict:
+        """Parameters of the replayer: at full speed, once all nodes have joined."""
+        return {"bag": str(Path(bag).absolute()), "rate": 0.0, "exclude": self.outdated,
+                "remap": tuple(f"{name}:=/{topic}" for name, topic in self.renamed.items()),
+                "wait_for_subscribers": 0,
+                "wait_for_nodes": ("recorder", "smoothing_trigger", *self.estimators)}
+
+
+def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
+                  without: Collection[str] = (), remap: Mapping[str, str] | None = None) -> Plan:
+    """What a pipeline would do with a recording; arguments as of :func:`run_pipeline`.
+
+    Raises:
+        ImuFusionError: recording, parameters or topics are not usable, or there is nothing to
+            smooth.
+    """
+    for name in without:
+        if name not in STAGES or name == SMOOTHER:
+            raise TopicError(f"no estimator '{name}' to leave out; there are: "
+                             + ", ".join(node for node in STAGES if node != SMOOTHER))
+    estimators: list[str] = []
+    renamed: dict[str, str] = {}
+    made: set[str] = set()
+    with open_bag(bag) as reader:
+        for stage in STAGES.values():
+            # Here, for a bad file to be refused before anything starts.
+            stage, _ = stage.prepare(params_file)
+            if stage.node in without or stage.unusable:
+                continue
+            names, missing = find_inputs(reader, *stage.input_types(), remap or {})
+            if missing and stage.node == SMOOTHER:
+                raise TopicError(f"nothing to smooth: {missing}")
+            if missing:
+                continue
+            estimators.append(stage.node)
+            made |= stage.outputs.keys()
+            renamed |= {name: topic for topic, name in names.items() if name.lstrip("/") != topic}
+        outdated = tuple(name for name in reader.topics if name.lstrip("/") in made)
+    return Plan(tuple(estimators), renamed, outdated)
+
+
+def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
+                 without: Collection[str] = (), remap: Mapping[str, str] | None = None,
+                 overwrite: bool = False, logs: str | Path | None = None,
+                 show: bool = True) -> int:
     """Replay a recording through the estimators into a new recording.
 
     Args:
@@ -40,45 +99,22 @@ def run(bag, out, params_file=None, without=(), remap=None, overwrite=False, log
     Raises:
         ImuFusionError: recording, parameters or topics are not usable, or a node failed.
     """
-    for name in without:
-        if name not in STAGES or name == SMOOTHER:
-            raise TopicError(f"no estimator '{name}' to leave out; there are: "
-                             + ", ".join(set(STAGES) - {SMOOTHER}))
-    renamed, estimators, made = {}, [], set()
-    with open_bag(bag) as reader:
-        for stage in STAGES.values():
-            # Here, for a bad file to be refused before anything starts.
-            stage, _ = stage.prepare(params_file)
-            if stage.node in without or stage.unusable:
-                continue
-            names, missing = find_inputs(reader, *stage.input_types(), remap or {})
-            if missing and stage.node != SMOOTHER:
-                continue
-            if missing:
-                raise TopicError(f"nothing to smooth: {missing}")
-            estimators.append(stage.node)
-            made |= stage.outputs.keys()
-            renamed |= {name: topic for topic, name in names.items()
-                        if name.lstrip("/") != topic}
-        old = tuple(name for name in reader.topics if name.lstrip("/") in made)
-    common = {"params_file": params_file and Path(params_file).absolute()}
-    with Graph(logs) as graph:
-        graph.start("recorder", **common, out=str(Path(out).absolute()), overwrite=overwrite,
-                    end_with_sources=True, expected_sources=(SMOOTHER,))
-        for node in estimators:
-            graph.start(node, **common, qos="reliable")
-        graph.start("smoothing_trigger", show=show, **common)
-        graph.start("replayer", show=show, **common, bag=str(Path(bag).absolute()), rate=0.0,
-                    exclude=old,
-                    remap=tuple(f"{name}:=/{topic}" for name, topic in renamed.items()),
-                    wait_for_subscribers=0, wait_for_nodes=("recorder", "smoothing_trigger", *estimators))
-        graph.wait("replayer", _PATIENCE)
-        graph.wait("smoothing_trigger", _PATIENCE)
+    plan = plan_pipeline(bag, params_file, without, remap)
+    file = Path(params_file).absolute() if params_file else None
+    with NodeProcesses(logs) as nodes:
+        nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
+                    overwrite=overwrite, end_with_sources=True, expected_sources=(SMOOTHER,))
+        for node in plan.estimators:
+            nodes.start(node, params_file=file, qos="reliable")
+        nodes.start("smoothing_trigger", show=show, params_file=file)
+        nodes.start("replayer", show=show, params_file=file, **plan.replay_parameters(bag))
+        nodes.wait("replayer", _PATIENCE)
+        nodes.wait("smoothing_trigger", _PATIENCE)
         # Rarely the recorder does not notice the end of the smoother's session (why is not
         # understood): then its file has stopped growing.
-        graph.finish("recorder", 15.0, lambda: sum(
+        nodes.finish("recorder", 15.0, lambda: sum(
             file.stat().st_size for file in Path(out).glob("*.mcap")))
-        domain = graph.domain
+        domain = nodes.domain
     with open_bag(out) as reader:
         found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
     write_results(out, {SMOOTHER: found[-1]} if found else {})

@@ -7,19 +7,21 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import yaml
 
-from imu_fusion.kernels import NOTICE
+from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.kernels import NOTICE
 
 
-class GraphError(ImuFusionError):
+class NodeError(ImuFusionError):
     """A node did not start, did not end or ended with an error."""
 
 
-def free_domain():
+def free_domain() -> int:
     """A ROS domain id (1 to 101) that nobody on this machine uses.
 
     DDS participants of a domain bind the UDP ports from 7400 + 250 * id on.
@@ -29,7 +31,7 @@ def free_domain():
         domain = 1 + (first + i) % 101
         if all(_is_free(7400 + 250 * domain + offset) for offset in (0, 10, 11, 12)):
             return domain
-    raise GraphError("all ROS domain ids from 1 to 101 are in use on this machine")
+    raise NodeError("all ROS domain ids from 1 to 101 are in use on this machine")
 
 
 def _is_free(port):
@@ -41,8 +43,11 @@ def _is_free(port):
     return True
 
 
-class Graph:
+class NodeProcesses:
     """Processes of our nodes; leaving the context ends those that still run.
+
+    Entering it compiles the kernels where that has not been done: nodes that compile would keep
+    the others waiting, each for itself.
 
     Args:
         logs: directory for what the nodes print, one file per node; a temporary
@@ -50,14 +55,15 @@ class Graph:
         domain: ROS domain id, a free one if None.
     """
 
-    def __init__(self, logs=None, domain=None):
+    def __init__(self, logs: str | Path | None = None, domain: int | None = None):
         self.domain = free_domain() if domain is None else domain
         self._logs = Path(logs or tempfile.mkdtemp(prefix="imu_fusion_"))
         self._logs.mkdir(parents=True, exist_ok=True)
-        self._processes = {}
+        self._processes: dict[str, subprocess.Popen] = {}
         self._announced = False
 
-    def __enter__(self):
+    def __enter__(self) -> "NodeProcesses":
+        compile_ahead(_say)
         return self
 
     def __exit__(self, *_):
@@ -72,7 +78,8 @@ class Graph:
                 process.kill()
                 process.wait()
 
-    def start(self, node, show=False, params_file=None, **parameters):
+    def start(self, node: str, show: bool = False, params_file: str | Path | None = None,
+              **parameters: object) -> None:
         """Start a node.
 
         Args:
@@ -98,28 +105,29 @@ class Graph:
                 stdout=None if show else log, stderr=None if show else subprocess.STDOUT,
                 start_new_session=True)
 
-    def wait(self, node, timeout):
+    def wait(self, node: str, timeout: float) -> None:
         """Wait until a node has ended by itself; seconds.
 
         Raises:
-            GraphError: this or another node failed, or it took too long; with its last words.
+            NodeError: this or another node failed, or it took too long; with its last words.
         """
         deadline = time.monotonic() + timeout
         while self._processes[node].poll() is None:
             self._announce_compiling()
             for name, process in self._processes.items():
                 if process.poll():
-                    raise GraphError(f"node {name} ended with code {process.returncode}: "
+                    raise NodeError(f"node {name} ended with code {process.returncode}: "
                                      f"{self._last_words(name)}")
             if time.monotonic() > deadline:
-                raise GraphError(f"node {node} has not ended after {timeout:g} s: "
+                raise NodeError(f"node {node} has not ended after {timeout:g} s: "
                                  f"{self._last_words(node)}")
             time.sleep(0.05)
         if self._processes[node].returncode:
-            raise GraphError(f"node {node} ended with code {self._processes[node].returncode}: "
+            raise NodeError(f"node {node} ended with code {self._processes[node].returncode}: "
                              f"{self._last_words(node)}")
 
-    def finish(self, node, patience, progress=lambda: None):
+    def finish(self, node: str, patience: float,
+               progress: Callable[[], object] = lambda: None) -> bool:
         """Wait for the end of a node; ask it to end (as Ctrl-C does) when nothing moves any more.
 
         Args:
@@ -129,7 +137,7 @@ class Graph:
             Whether the node ended by itself.
 
         Raises:
-            GraphError: as :meth:`wait`.
+            NodeError: as :meth:`wait`.
         """
         process, seen, since = self._processes[node], progress(), time.monotonic()
         while process.poll() is None and time.monotonic() - since < patience:
@@ -147,12 +155,20 @@ class Graph:
         """Say once what a node says into its log only."""
         if not self._announced and any(NOTICE in self.log(node) for node in self._processes):
             self._announced = True
-            print(NOTICE, file=sys.stderr, flush=True)
+            _say(NOTICE)
 
-    def log(self, node):
+    def process(self, node: str) -> subprocess.Popen:
+        """The process of a node that was started."""
+        return self._processes[node]
+
+    def log(self, node: str) -> str:
         """What a node has printed so far."""
         return (self._logs / f"{node}.log").read_text(errors="replace")
 
     def _last_words(self, node):
         lines = self.log(node).strip().splitlines()
         return " | ".join(lines[-3:]) or f"nothing in {self._logs / (node + '.log')}"
+
+
+def _say(text):
+    print(text, file=sys.stderr, flush=True)

@@ -111,8 +111,9 @@ class SmootherNode(Node):
         for topic, kind in INPUTS.items():
             self._sink.subscribe(message_class(kind.layout.msgtype), topic,
                                  lambda cdr, _, topic=topic: self._collection.push(topic, cdr), qos)
-        if self.params(SmoothingParams).surface:
-            load_surface(self.params(SmoothingParams).surface)  # a bad file ends the node now
+        surface_file = self.params(SmoothingParams).surface.file
+        if surface_file:
+            load_surface(surface_file)  # a bad file ends the node now
         self._source = FlowSource(self)
         self._outputs = {topic: self._source.publisher(message_class(msgtype), topic, _latched(1))
                          for topic, msgtype in OUTPUTS.items()}

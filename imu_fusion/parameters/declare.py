@@ -22,14 +22,16 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Mapping
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ClassVar, NoReturn, Self, TypeGuard
 
 from imu_fusion.errors import ParameterError
 
 
-def param(default=dataclasses.MISSING, *, doc, unit="", low=None, high=None, choices=None,
-          length=None, read_only=True, path=False):
+def param(default: Any = dataclasses.MISSING, *, doc: str, unit: str = "", low: float | None = None,
+          high: float | None = None, choices: tuple[str, ...] | None = None,
+          length: int | tuple[int, ...] | None = None, read_only: bool = True,
+          path: bool = False) -> Any:
     """Declare one parameter as a dataclass field.
 
     Args:
@@ -67,7 +69,7 @@ class ParameterInfo:
     read_only: bool
     path: bool
 
-    def describe_bounds(self):
+    def describe_bounds(self) -> str:
         """The permitted values in words, for messages and tables."""
         if self.choices:
             return "one of " + ", ".join(map(str, self.choices))
@@ -83,7 +85,7 @@ class ParameterInfo:
             parts.append(" or ".join(map(str, lengths)) + " elements")
         return ", ".join(parts)
 
-    def check(self, value, source=""):
+    def check(self, value: Any, source: str = "") -> Any:
         """Return ``value`` in this parameter's type, or raise ParameterError."""
         where = f" (from {source})" if source else ""
 
@@ -111,11 +113,11 @@ class ParameterInfo:
                 refuse(f"has {len(result)} elements")
         return result
 
-    def _may_be_one(self):
+    def _may_be_one(self) -> bool:
         """Whether a tuple of one stands for all elements: then a plain number does too."""
         return isinstance(self.length, tuple) and 1 in self.length
 
-    def _check_element(self, value, refuse):
+    def _check_element(self, value: Any, refuse: Callable[[str], NoReturn]) -> Any:
         if self.element is bool:
             if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):
                 refuse("is not true or false")
@@ -141,7 +143,7 @@ class ParameterInfo:
         return number
 
 
-def split_type(annotation):
+def split_type(annotation: Any) -> tuple[Any, bool, bool]:
     """(element type, is tuple, optional) of a field's annotation."""
     optional = False
     if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
@@ -162,7 +164,7 @@ class Parameters:
 
     OLD_NAMES: ClassVar[Mapping[str, str]] = {}
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for field, kind in fields_of(type(self)):
             if not is_group(kind):
                 object.__setattr__(self, field.name,
@@ -175,14 +177,14 @@ class Parameters:
             if why is not None and self.get(name) != info.default:
                 raise ParameterError(f"parameter '{name}': does nothing {why}; leave it out")
 
-    def idle(self):
+    def idle(self) -> Mapping[str, str]:
         """Parameters that do nothing under the values chosen: dict of dotted name (or of the prefix
         of a group, ending in a dot) to the reason, as in "with method 'gyro_mag'". Set to
         anything but their default, they are refused."""
         return {}
 
     @classmethod
-    def infos(cls):
+    def infos(cls) -> list[ParameterInfo]:
         """A list of ParameterInfo, in order of declaration, with dotted names."""
         result = []
         for field, kind in fields_of(cls):
@@ -198,7 +200,8 @@ class Parameters:
         return result
 
     @classmethod
-    def from_mapping(cls, values, source="", ignore=()):
+    def from_mapping(cls, values: Mapping[str, Any], source: str = "",
+                     ignore: Sequence[str] = ()) -> Self:
         """Make parameters from a mapping, nested or with dotted names.
 
         Args:
@@ -229,7 +232,7 @@ class Parameters:
             raise ParameterError(f"{error}{where}") from None
 
     @classmethod
-    def _made(cls, flat):
+    def _made(cls, flat: Mapping[str, Any]) -> Self:
         """From dotted names, of which the missing ones keep their defaults."""
         own = {}
         for field, kind in fields_of(cls):
@@ -244,22 +247,23 @@ class Parameters:
                 own[field.name] = flat[field.name]
         return cls(**own)
 
-    def get(self, name):
+    def get(self, name: str) -> Any:
         """The value of a dotted name."""
         value = self
         for part in name.split("."):
             value = getattr(value, part)
         return value
 
-    def to_mapping(self):
+    def to_mapping(self) -> dict[str, Any]:
         """Dotted names and values, without what is unset."""
         pairs = ((info.name, self.get(info.name)) for info in self.infos())
         return {name: list(value) if isinstance(value, tuple) else value
                 for name, value in pairs if value is not None}
 
-    def replace(self, **changes):
-        """A validated copy with changes; names may be dotted: ``replace(**{"sensor.x": 1})``."""
-        own, inner = {}, {}
+    def replace(self, **changes: Any) -> Self:
+        """A validated copy with changes, by field or by dotted name."""
+        own: dict[str, Any] = {}
+        inner: dict[str, dict[str, Any]] = {}
         for name, value in changes.items():
             first, dot, rest = name.partition(".")
             if dot:
@@ -271,24 +275,24 @@ class Parameters:
         return dataclasses.replace(self, **own)
 
 
-def fields_of(cls):
+def fields_of(cls: type) -> list[tuple[dataclasses.Field, Any]]:
     """(dataclass field, its annotation) of each field, in order."""
     hints = typing.get_type_hints(cls)
     return [(field, hints[field.name]) for field in dataclasses.fields(cls)]
 
 
-def is_group(kind):
+def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
     """Whether an annotation is that of a group of parameters."""
     return isinstance(kind, type) and issubclass(kind, Parameters)
 
 
-def _info(field, kind):
+def _info(field: dataclasses.Field, kind: Any) -> ParameterInfo:
     element, is_tuple, optional = split_type(kind)
     return ParameterInfo(name=field.name, kind=kind, element=element, is_tuple=is_tuple,
                          optional=optional, default=field.default, **field.metadata)
 
 
-def unknown_parameter(name, classes):
+def unknown_parameter(name: str, classes: Iterable[type[Parameters]]) -> str:
     """What to say of a name that none of the Parameters ``classes`` has."""
     for cls in classes:
         if name in cls.OLD_NAMES:
@@ -297,7 +301,7 @@ def unknown_parameter(name, classes):
     return f"unknown parameter '{name}'; known: {', '.join(known)}"
 
 
-def flatten(values, prefix=""):
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Dotted names of a nested mapping: ``{'a': {'b': 1}}`` becomes ``{'a.b': 1}``."""
     flat = {}
     for key, value in values.items():
@@ -309,7 +313,7 @@ def flatten(values, prefix=""):
     return flat
 
 
-def markdown_table(cls):
+def markdown_table(cls: type[Parameters]) -> str:
     """The parameters of ``cls`` as the rows of a Markdown table."""
     lines = ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
     for info in cls.infos():

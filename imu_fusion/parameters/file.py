@@ -1,14 +1,16 @@
 """ROS 2 parameter files, read without ROS: the same file serves nodes and batch."""
 
+from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.parameters.declare import flatten, unknown_parameter
+from imu_fusion.parameters.declare import Parameters, flatten, unknown_parameter
 
 
-def load(path):
+def load(path: str | Path) -> dict[str, dict[str, Any]]:
     """Read a parameter file.
 
     Args:
@@ -30,13 +32,13 @@ def load(path):
         raise ParameterError(f"{path}: is not YAML: {error}") from None
     if content is None:
         return {}
-    nodes = {}
+    nodes: dict[str, dict[str, Any]] = {}
     for key, body in _walk(path, content):
         nodes.setdefault(key, {}).update(body)
     return nodes
 
 
-def _walk(path, content, prefix=""):
+def _walk(path: Path, content: Any, prefix: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: '{prefix or 'the top level'}' must map node names to "
                              "'ros__parameters'")
@@ -48,7 +50,8 @@ def _walk(path, content, prefix=""):
             yield from _walk(path, body, f"{prefix}{key}/")
 
 
-def parameters_for(classes, node, path=None, ignore=()):
+def parameters_for(classes: Sequence[type[Parameters]], node: str, path: str | Path | None = None,
+                   ignore: Sequence[str] = ()) -> list[Any]:
     """The parameters of one node from a file, or its defaults without one.
 
     Args:
@@ -80,7 +83,8 @@ def parameters_for(classes, node, path=None, ignore=()):
     return result
 
 
-def resolve_paths(values, classes, node, paths):
+def resolve_paths(values: dict[str, Any], classes: Iterable[type[Parameters]], node: str,
+                  paths: Sequence[str | Path]) -> None:
     """Relative file names that parameter files set become relative to those files.
 
     Args:
@@ -101,7 +105,7 @@ def resolve_paths(values, classes, node, paths):
                 break
 
 
-def node_values(node, path, known):
+def node_values(node: str, path: str | Path | None, known: Container[str]) -> dict[str, Any]:
     """Names and values, dotted, that a file gives to a node: of ``/**`` only the known ones.
 
     An empty dict without a file (path None).

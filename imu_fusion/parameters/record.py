@@ -4,16 +4,15 @@ The dtype follows from the dataclass, so a parameter is declared in one place; i
 kernel's signature, so a changed declaration compiles anew.
 """
 
-from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from imu_fusion.parameters.declare import Parameters, fields_of, is_group, split_type
 
+_DTYPES: dict[type[Parameters], np.dtype] = {}
 
-@cache
+
 def record_dtype(cls: type[Parameters]) -> np.dtype:
     """The structured dtype of a Parameters class.
 
@@ -21,6 +20,8 @@ def record_dtype(cls: type[Parameters]) -> np.dtype:
     length, nan where unset, one value standing for all; a group: a nested record. Strings,
     tuples without a length and unset integers are for the estimator, not for its kernel: left out.
     """
+    if cls in _DTYPES:
+        return _DTYPES[cls]
     fields: list[tuple[Any, ...]] = []
     for field, kind in fields_of(cls):
         if is_group(kind):
@@ -32,7 +33,7 @@ def record_dtype(cls: type[Parameters]) -> np.dtype:
             continue
         size = (max(length) if isinstance(length, tuple) else length,) if is_tuple else ()
         fields.append((field.name, {float: "f8", int: "i8", bool: "?"}[element], size))
-    return np.dtype(fields, align=True)
+    return _DTYPES.setdefault(cls, np.dtype(fields, align=True))
 
 
 def record(params: Parameters, **derived: Any) -> np.ndarray:
@@ -46,7 +47,7 @@ def record(params: Parameters, **derived: Any) -> np.ndarray:
     dtype = record_dtype(type(params))
     if derived:
         values = {name: np.asarray(value) for name, value in derived.items()}
-        dtype = np.dtype([*((name, dtype.fields[name][0]) for name in dtype.names),
+        dtype = np.dtype([*((name, dtype[name]) for name in dtype.names or ()),
                           *((name, v.dtype, v.shape) for name, v in values.items())], align=True)
         result = np.zeros(1, dtype)
         for name, v in values.items():
@@ -58,8 +59,7 @@ def record(params: Parameters, **derived: Any) -> np.ndarray:
 
 
 def _fill(target: Any, params: Parameters) -> None:
-    dtype: Mapping[str, Any] = record_dtype(type(params)).fields or {}
-    for name, (kind, *_) in dtype.items():
+    for name in record_dtype(type(params)).names or ():
         value = getattr(params, name)
         if isinstance(value, Parameters):
             _fill(target[name], value)

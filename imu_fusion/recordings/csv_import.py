@@ -20,6 +20,7 @@ import csv
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -31,7 +32,11 @@ from imu_fusion.messages.layouts import IMU, NANOSECONDS
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.streams.acceleration_field import (
-    GYROSCOPE_TOPIC, NODE, NODE_PARAMETERS, FieldConfiguration)
+    GYROSCOPE_TOPIC,
+    NODE,
+    NODE_PARAMETERS,
+    FieldConfiguration,
+)
 
 TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -290,7 +295,7 @@ def _parameters(sensors, given, stamps):
     arrays = {s.topic.rpartition("/")[2]: {"position": list(s.params.position),
                                            **_changed(s.params)} for s in sensors
               if isinstance(s.params, AccelerometerParams)}
-    values = {"accelerometers": {"names": list(arrays), **arrays}}
+    values: dict[str, Any] = {"accelerometers": {"names": list(arrays), **arrays}}
     flat = flatten(given)
     for s in sensors:
         if isinstance(s.params, Sensor):

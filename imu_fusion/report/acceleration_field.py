@@ -65,24 +65,24 @@ def _field(data, time):
         Panel("σ at the origin in m/s²", tuple(Line(words, time, sd, color)
                                                for words, sd, color in stated), from_zero=True)]
     words = ("Magnitudes at the query points. The specific force is what accelerometers there "
-             "would feel and needs no orientation; the kinematic acceleration is without gravity. As "
-             "a vector in the world it shares the uncertainty of the orientation, which turns it "
-             "and hardly changes its magnitude.")
+             "would feel and needs no orientation; the kinematic acceleration is without gravity. "
+             "As a vector in the world it shares the uncertainty of the orientation, which turns "
+             "it and hardly changes its magnitude.")
+    rate, turning = (np.linalg.norm(data.rows[name], axis=1).max() for name in ("omega", "alpha"))
     return Section("Acceleration field", (
         Numbers((Number("Samples", str(len(time))),
-                 Number("Peak acceleration", f"{magnitude.max():.1f} m/s²", "kinematic, all points"),
-                 Number("Peak rate", f"{np.linalg.norm(data.rows['omega'], axis=1).max():.1f} "
-                        "rad/s"),
-                 Number("Peak angular acc.", f"{np.linalg.norm(data.rows['alpha'], axis=1).max():.0f}"
-                        " rad/s²"))),
+                 Number("Peak acceleration", f"{magnitude.max():.1f} m/s²",
+                        "kinematic, all points"),
+                 Number("Peak rate", f"{rate:.1f} rad/s"),
+                 Number("Peak angular acc.", f"{turning:.0f} rad/s²"))),
         Table(("point x, y, z in m", "peak m/s²", "at s", "RMS m/s²", "peak specific force m/s²"),
               tuple(rows)),
         Figure(time_figure(panels), words),
         Figure(field_picture(data, time, magnitude[:, 0]),
-               "The kinematic acceleration of points of the body, in body axes, around the greatest "
-               "magnitude at the first query point. The slider moves through time; all arrows have "
-               "one scale and a dot as their head. The line from the origin without a head is the "
-               "angular velocity.",
+               "The kinematic acceleration of points of the body, in body axes, around the "
+               "greatest magnitude at the first query point. The slider moves through time; all "
+               "arrows have one scale and a dot as their head. The line from the origin without a "
+               "head is the angular velocity.",
                linked=False)))
 
 
@@ -179,7 +179,8 @@ def _comparison(data, clipped):
     sd = np.sqrt(np.einsum("nii->ni", data.rows["cov_omega"]))
     known = np.isfinite(difference)
     table = []
-    for name, mask in (("gyroscope below its limit", known & ~clipped), (_CLIPPED, known & clipped)):
+    for name, mask in (("gyroscope below its limit", known & ~clipped),
+                       (_CLIPPED, known & clipped)):
         if not mask.any():
             continue
         part = difference[mask]

@@ -3,5 +3,5 @@
 from imu_fusion.samples.logs import (AccelerometerLog, AttitudeLog, FixLog, ImuLog, MagLog,
                                      PoseLog, VelocityLog, seconds)
 
-__all__ = ["AccelerometerLog", "AttitudeLog", "FixLog", "ImuLog", "MagLog", "PoseLog", "VelocityLog",
-           "seconds"]
+__all__ = ["AccelerometerLog", "AttitudeLog", "FixLog", "ImuLog", "MagLog", "PoseLog",
+           "VelocityLog", "seconds"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.samples.logs import seconds
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, seconds
 
 # Longer than this many usual intervals: at least one sample is missing.
 GAP_FACTOR = 1.8
@@ -67,7 +67,7 @@ class FlatTop:
     runs: int
 
 
-def timing(stamp):
+def timing(stamp: np.ndarray) -> Timing:
     """Timing of a stream.
 
     Args:
@@ -75,12 +75,12 @@ def timing(stamp):
     """
     stamp = np.asarray(stamp, dtype=np.int64)
     if len(stamp) < 2:
-        return Timing(len(stamp), 0.0, *[np.nan] * 3, 0, np.nan, 0, 0)
+        return Timing(len(stamp), 0.0, np.nan, np.nan, np.nan, 0, np.nan, 0, 0)
     step = np.diff(stamp)
     forward = step[step > 0] * 1e-9
     duration = float(seconds(stamp.max(), stamp.min()))
     if len(forward) == 0:
-        return Timing(len(stamp), duration, *[np.nan] * 3, 0, np.nan,
+        return Timing(len(stamp), duration, np.nan, np.nan, np.nan, 0, np.nan,
                       int(np.sum(step == 0)), int(np.sum(step < 0)))
     interval = float(np.median(forward))
     low, high = np.percentile(forward, [16, 84])
@@ -93,7 +93,7 @@ def timing(stamp):
         backwards=int(np.sum(step < 0)))
 
 
-def check_stamps(stamp, name):
+def check_stamps(stamp: np.ndarray, name: str) -> list[Finding]:
     """Findings about the order, repetition and gaps of stamps (n,) int64 ns."""
     stamp = np.asarray(stamp, dtype=np.int64)
     result = []
@@ -118,7 +118,7 @@ def check_stamps(stamp, name):
     return result
 
 
-def check_finite(values, name, quantity):
+def check_finite(values: np.ndarray, name: str, quantity: str) -> list[Finding]:
     """A finding about rows (n, ...) that are not numbers."""
     values = np.asarray(values)
     values = values.reshape(len(values), int(np.prod(values.shape[1:])))
@@ -129,7 +129,7 @@ def check_finite(values, name, quantity):
                            f"finite, first at sample {bad[0]}; they are left out")]
 
 
-def flat_tops(values, limit=None):
+def flat_tops(values: np.ndarray, limit: float | None = None) -> list[FlatTop]:
     """Where axes stand still at their extreme: the mark of a saturated sensor.
 
     Args:
@@ -164,7 +164,7 @@ def flat_tops(values, limit=None):
     return result
 
 
-def usual_run(values):
+def usual_run(values: np.ndarray) -> int:
     """How many times values (n,) or rows (n, k) usually stand before they change: 1 for a
     sensor that is read at its own rate, 3 for one that is read three times per measurement."""
     values = np.asarray(values).reshape(len(values), -1)
@@ -175,7 +175,7 @@ def usual_run(values):
     return max(int(np.percentile(np.diff(changes), 95)), 1)
 
 
-def check_held(values, stamp, name):
+def check_held(values: np.ndarray, stamp: np.ndarray, name: str) -> list[Finding]:
     """A finding if samples (n, k) are mostly repetitions of the one before."""
     values = np.asarray(values)
     if len(values) < 3:
@@ -187,7 +187,8 @@ def check_held(values, stamp, name):
                             f"the sensor updates at about {timing(stamp).rate_hz * share:.3g} Hz")]
 
 
-def check_saturation(values, name, quantity, unit, limit=None):
+def check_saturation(values: np.ndarray, name: str, quantity: str, unit: str,
+                     limit: float | None = None) -> list[Finding]:
     """Findings about flat tops of ``values`` (n, 3)."""
     return [Finding("saturation",
                     f"{name}: {quantity} {'xyz'[top.axis]} stands at {top.limit:.6g} {unit} for "
@@ -195,7 +196,7 @@ def check_saturation(values, name, quantity, unit, limit=None):
             for top in flat_tops(values, limit)]
 
 
-def check_acceleration(acc, stamp, name):
+def check_acceleration(acc: np.ndarray, stamp: np.ndarray, name: str) -> list[Finding]:
     """A finding if specific force (n, 3) is not in m/s^2, or has gravity removed.
 
     Judged at its quietest half seconds, where mostly gravity acts.
@@ -218,7 +219,7 @@ def check_acceleration(acc, stamp, name):
     return []
 
 
-def check_field(mag, name):
+def check_field(mag: np.ndarray, name: str) -> list[Finding]:
     """A finding if a magnetic flux density (n, 3) is not in tesla, or not like the Earth's."""
     norms = np.linalg.norm(np.asarray(mag, dtype=np.float64), axis=1)
     norms = norms[np.isfinite(norms)]
@@ -242,7 +243,7 @@ def check_field(mag, name):
                             "67e-6 T: not a magnetic field in tesla")]
 
 
-def check_axes(imu, mag, name):
+def check_axes(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
     """A finding if the field does not turn against the gyroscope as it must.
 
     The direction b of a constant field obeys ``db/dt = b x w`` in sensor axes (Winkler 2025,
@@ -289,7 +290,7 @@ def check_axes(imu, mag, name):
     return []
 
 
-def check_imu(log, name="imu/data_raw"):
+def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
     """All findings about an ImuLog; that it lacks one of its two parts throughout is none."""
     parts = [(part, what) for part, what in ((log.gyr, "angular velocity"),
                                              (log.acc, "acceleration"))
@@ -302,14 +303,14 @@ def check_imu(log, name="imu/data_raw"):
             *check_saturation(log.acc, name, "acceleration", "m/s^2")]
 
 
-def check_mag(log, name="imu/mag"):
+def check_mag(log: MagLog, name: str = "imu/mag") -> list[Finding]:
     """All findings about a MagLog."""
     return [*check_stamps(log.stamp, name), *check_finite(log.mag, name, "the magnetic field"),
             *check_field(log.mag, name), *check_held(log.mag, log.stamp, name),
             *check_saturation(log.mag, name, "the field", "T")]
 
 
-def check_fix(log, name="fix"):
+def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
     """All findings about a FixLog."""
     position = np.column_stack([log.latitude_deg, log.longitude_deg, log.height])
     result = [*check_stamps(log.stamp, name)]
@@ -330,7 +331,7 @@ def check_fix(log, name="fix"):
     return result
 
 
-def _s(count):
+def _s(count: int) -> str:
     return "" if count == 1 else "s"
 
 

@@ -9,8 +9,13 @@ begins, and estimators start anew with it.
 
 import enum
 from collections import Counter
+from typing import TypeVar
 
 import numpy as np
+
+from imu_fusion.samples.logs import Log
+
+AnyLog = TypeVar("AnyLog", bound=Log)
 
 JUMP_BACK = 1_000_000_000
 """Nanoseconds. Transport delays reorder samples by less, restarts go back by more."""
@@ -28,12 +33,12 @@ class Verdict(enum.Enum):
 class Guard:
     """The rule for one topic; ``epoch`` counts the clock's jumps back."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.epoch = 0
-        self.last = None
-        self.counts = Counter()
+        self.last: int | None = None
+        self.counts: Counter[Verdict] = Counter()
 
-    def check(self, stamp, values):
+    def check(self, stamp: int, values: np.ndarray) -> Verdict:
         """Judge the next sample.
 
         Args:
@@ -58,13 +63,13 @@ class Guard:
         self.counts[verdict] += 1
         return verdict
 
-    def refused(self):
+    def refused(self) -> dict[str, int]:
         """Counts of what was refused, in words."""
         return {verdict.value: count for verdict, count in self.counts.items()
                 if verdict is not Verdict.OK and count}
 
 
-def guard_log(log):
+def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
     """The usable samples of a whole log.
 
     Returns:

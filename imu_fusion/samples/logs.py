@@ -6,13 +6,14 @@ are fit for use is decided by :mod:`imu_fusion.samples.guard`.
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import Any, Self
 
 import numpy as np
 
 from imu_fusion.errors import SampleError
 
 
-def seconds(stamp, origin):
+def seconds(stamp: np.ndarray, origin: int) -> np.ndarray:
     """Float seconds of integer nanosecond stamps since ``origin``: subtract, then convert."""
     return (np.asarray(stamp, dtype=np.int64) - np.int64(origin)) * 1e-9
 
@@ -27,7 +28,7 @@ class Log:
 
     stamp: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         stamp = np.ascontiguousarray(self.stamp)
         if stamp.ndim != 1 or not (np.issubdtype(stamp.dtype, np.integer) or stamp.size == 0):
             raise SampleError(f"{type(self).__name__}: stamps must be a one-dimensional array "
@@ -50,10 +51,10 @@ class Log:
         return [(f.name, f.metadata["shape"]) for f in dataclasses.fields(cls)
                 if "shape" in f.metadata]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.stamp)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: Any) -> Self:
         """The rows that a slice, mask or index array selects, as a log of the same type."""
         if isinstance(index, (int, np.integer)):
             index = slice(index, index + 1 or None)
@@ -61,13 +62,13 @@ class Log:
                    if getattr(self, name) is not None}
         return dataclasses.replace(self, stamp=self.stamp[index], **changes)
 
-    def flat(self):
+    def flat(self) -> np.ndarray:
         """All columns side by side: (n, k) float64, without the stamps."""
         columns = [getattr(self, name).reshape(len(self), int(np.prod(shape)))
                    for name, shape in self._columns() if getattr(self, name) is not None]
         return np.concatenate([np.empty((len(self), 0)), *columns], axis=1)
 
-    def between(self, start, stop):
+    def between(self, start: int, stop: int) -> Self:
         """The rows with ``start <= stamp < stop`` (int nanoseconds)."""
         return self[(self.stamp >= start) & (self.stamp < stop)]
 

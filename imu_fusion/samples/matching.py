@@ -1,8 +1,12 @@
 """Samples of several sensors that belong together, found by their stamps."""
 
 from bisect import bisect_left
+from typing import Any
 
 import numpy as np
+
+Row = tuple[int, np.ndarray]
+"""Stamp and readings (sensors, width) that belong to it."""
 
 
 class SampleMatcher:
@@ -21,19 +25,19 @@ class SampleMatcher:
         tolerance, hold: int nanoseconds.
     """
 
-    def __init__(self, sensors, width, tolerance, hold):
+    def __init__(self, sensors: int, width: int, tolerance: int, hold: int) -> None:
         self._shape = (sensors, width)
         self._tolerance = tolerance
         self._hold = hold
         self.late = 0
         self.duplicates = 0
         self.incomplete = 0
-        self._stamps = []   # of the waiting rows, ascending
-        self._rows = []     # [readings, number of sensors in it]
-        self._newest = None
-        self._left = None   # stamp of the last row that left
+        self._stamps: list[int] = []   # of the waiting rows, ascending
+        self._rows: list[Any] = []     # [readings, number of sensors in it]
+        self._newest: int | None = None
+        self._left: int | None = None   # stamp of the last row that left
 
-    def add(self, sensor, stamp, sample):
+    def add(self, sensor: int, stamp: int, sample: np.ndarray) -> list[Row]:
         """Take one sample; return the list of (stamp, readings (sensors, width)) that leave."""
         if self._left is not None and stamp <= self._left + self._tolerance:
             self.late += 1
@@ -52,17 +56,17 @@ class SampleMatcher:
         self._newest = stamp if self._newest is None else max(self._newest, stamp)
         return self._leaving(self._newest - self._hold)
 
-    def flush(self):
+    def flush(self) -> list[Row]:
         """All rows that still wait, complete or not."""
         return self._leaving(np.inf)
 
-    def _find(self, stamp):
+    def _find(self, stamp: int) -> int | None:
         place = bisect_left(self._stamps, stamp - self._tolerance)
         if place < len(self._stamps) and self._stamps[place] <= stamp + self._tolerance:
             return place
         return None
 
-    def _leaving(self, bound):
+    def _leaving(self, bound: float) -> list[Row]:
         leaving = []
         while self._stamps and (len(self._rows[0][1]) == self._shape[0]
                                 or self._stamps[0] < bound):

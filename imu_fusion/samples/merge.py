@@ -7,6 +7,8 @@ the topics are listed.
 """
 
 import heapq
+from collections.abc import Callable, Container, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +17,12 @@ from imu_fusion.samples.guard import Guard, Verdict
 RESTART = "restart"
 """Event between two epochs: the clock was set back."""
 
+Event = tuple[str, int | None, Any]
+"""Topic, stamp, item; or RESTART, None, None."""
 
-def merge_order(stamps, epochs=None):
+
+def merge_order(stamps: Sequence[np.ndarray],
+                epochs: Sequence[np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The order in which strict merging releases the samples of several topics.
 
     Args:
@@ -46,25 +52,27 @@ class SampleStream:
     Verdict) for every sample that the guard refuses.
     """
 
-    def __init__(self, topics, refused=None):
+    def __init__(self, topics: Iterable[str],
+                 refused: Callable[[str, int, Verdict], object] | None = None) -> None:
         self._topics = list(topics)
         self._refused = refused
         self.begin(None)
 
-    def begin(self, session_topics):
+    def begin(self, session_topics: Container[str] | None) -> None:
         """Start over: strict merging of the topics named, or live (None).
 
         Topics of ours that are not named count as ended.
         """
         self.strict = session_topics is not None
+        named = session_topics or ()
         self.guards = {topic: Guard() for topic in self._topics}
-        self._heap = []
+        self._heap: list[Any] = []
         self._count = 0
         self._epoch = 0
         self._passed = {topic: (-1, 0) for topic in self._topics
-                        if self.strict and topic in session_topics}
+                        if topic in named}
 
-    def add(self, topic, stamp, values, item=None):
+    def add(self, topic: str, stamp: int, values: np.ndarray, item: Any = None) -> list[Event]:
         """Take one sample; return the list of events that may happen now.
 
         Args:
@@ -91,31 +99,31 @@ class SampleStream:
             self._passed[topic] = key
         return self._release()
 
-    def end(self, topic):
+    def end(self, topic: str) -> list[Event]:
         """No more samples of ``topic`` will come; return the events that this releases."""
         self._passed.pop(topic, None)
         return self._release()
 
     @property
-    def open_topics(self):
+    def open_topics(self) -> list[str]:
         """Topics of the session that have not ended."""
         return list(self._passed)
 
     @property
-    def held(self):
+    def held(self) -> int:
         """Number of samples that wait for another topic."""
         return len(self._heap)
 
-    def _restart_all(self, epoch):
+    def _restart_all(self, epoch: int) -> None:
         # Live, the other topics' clocks were set back too, seen yet or not.
         for guard in self.guards.values():
             if guard.epoch < epoch:
                 guard.epoch, guard.last = epoch, None
         self._epoch = epoch
 
-    def _release(self):
+    def _release(self) -> list[Event]:
         bound = min(self._passed.values(), default=None)
-        events = []
+        events: list[Event] = []
         while self._heap and (bound is None or self._heap[0][:2] <= bound):
             epoch, stamp, rank, _, item = heapq.heappop(self._heap)
             if epoch > self._epoch:

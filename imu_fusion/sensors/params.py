@@ -15,7 +15,7 @@ from imu_fusion.parameters.declare import param
 SENSOR: dict[str, dict[str, Any]] = {
     "gyro_noise_density": dict(
         unit="rad/s/sqrt(Hz)", low=1e-9, high=10.0,
-        doc="White noise of the gyroscope. Raise it for vibration that the sampling cannot follow."),
+        doc="Gyroscope white noise. Raise it for vibration that the sampling cannot follow."),
     "gyro_bias_sd": dict(
         unit="rad/s", low=0.0, high=1.0,
         doc="Standard deviation of the gyroscope's bias at the start."),

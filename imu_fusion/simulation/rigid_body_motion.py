@@ -7,8 +7,7 @@ estimator says, no more and no less.
 import numpy as np
 from scipy.linalg import cholesky
 
-from imu_fusion.estimation.acceleration_field.motion_model import (
-    mean_rotation, motion_step, parts)
+from imu_fusion.estimation.acceleration_field.motion_model import mean_rotation, motion_step, parts
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start

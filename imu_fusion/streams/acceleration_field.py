@@ -10,9 +10,11 @@ import numpy as np
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams,
-                                                             parse_configuration)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    parse_configuration,
+)
 from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED, field_at
 from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.messages.convert import SampleType, imu_message
@@ -238,9 +240,9 @@ def process_logs(logs, report, config):
             continue
         readings = np.array([r for _, r in matched])
         count = len(config.accelerometers)
-        gyr = readings[:, count] if config.field.use_gyro else None
         rows = estimator.run(np.array([s for s, _ in matched], dtype=np.int64),
-                             readings[:, :count], gyr)
+                             readings[:, :count],
+                             readings[:, count] if config.field.use_gyro else None)
         impacts += _impacts(config, rows)
         yield from messages(config, rows)
     if impacts:

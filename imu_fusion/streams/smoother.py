@@ -6,13 +6,16 @@ end in :func:`smooth`, and so in the same messages.
 
 import json
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, MessageError, SampleError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
 from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
@@ -44,13 +47,31 @@ _SLICE = 1000  # samples whose messages are made at once
 
 
 @dataclass(frozen=True)
+class SurfaceFile(SurfaceContact):
+    """Which surface, and how the body is held on it."""
+
+    file: str | None = param(
+        None, path=True, doc="Surface that the body moves on: a name in config/surfaces or the "
+        "path of a YAML file; unset: none.")
+
+
+@dataclass(frozen=True)
 class SmoothingParams(SmootherParams):
     """The smoother's parameters and what surrounds it."""
 
-    surface: str = param("", path=True, doc="Surface that the body moves on: a name in "
-                         "config/surfaces or the path of a YAML file; empty: none.")
+    OLD_NAMES: ClassVar[Mapping[str, str]] = {**SmootherParams.OLD_NAMES,
+                                              "surface": "surface.file"}
+
+    surface: SurfaceFile = SurfaceFile()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
-                             doc="Rate of the poses of smoother/path.")
+                             doc="Rate of the poses of smoother/path. Lower it for long "
+                                 "recordings.")
+
+    def idle(self) -> dict[str, str]:
+        idle = super().idle()
+        if self.surface.file is None:
+            idle |= dict.fromkeys(("surface.", "jump."), "without surface.file")
+        return idle
 
 
 @dataclass(frozen=True)
@@ -177,7 +198,7 @@ def smooth(params, logs):
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     chosen = newest_epoch(logs)
-    surface = load_surface(params.surface) if params.surface else None
+    surface = load_surface(params.surface.file) if params.surface.file else None
     return Smoother(params, surface).run(chosen[IMU_TOPIC], chosen.get(MAG_TOPIC),
                                          chosen[FIX_TOPIC], chosen.get(VELOCITY_TOPIC))
 
@@ -330,8 +351,8 @@ def process_logs(logs, report, params):
 
 def _configure(stage, params_file):
     (params,) = stage.read_params(params_file)
-    if params.surface:
-        load_surface(params.surface)  # a bad file is refused before anything is read
+    if params.surface.file:
+        load_surface(params.surface.file)  # a bad file is refused before anything is read
     return stage, [params]
 
 

@@ -3,9 +3,9 @@
 import rclpy
 import yaml
 
-from imu_fusion.recordings.csv_import import import_csv
 from imu_fusion.nodes import acceleration_field_estimator
 from imu_fusion.nodes.acceleration_field_estimator import AccelerationFieldEstimatorNode
+from imu_fusion.recordings.csv_import import import_csv
 from test.recordings.test_csv_import import describe, write
 
 

@@ -120,7 +120,7 @@ def test_who_comes_late_gets_all_of_the_last_result_and_nothing_else(graph, tmp_
 
 def test_a_bad_surface_ends_the_node_at_its_start(graph):
     with pytest.raises(LayoutError, match="nowhere"):
-        graph.start(SmootherNode, surface="nowhere")
+        graph.start(SmootherNode, **{"surface.file": "nowhere"})
 
 
 def test_without_samples_the_answer_is_no_with_the_reason(graph):

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import pytest
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.parameters.file import parameters_for
 from imu_fusion.parameters.declare import Parameters, markdown_table, param
+from imu_fusion.parameters.file import parameters_for
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,10 @@ def test_dataclass_is_checked_however_it_is_made():
 def test_file_of_ros_parameters_with_wildcard_and_namespace(tmp_path):
     (tmp_path / "hill.yaml").touch()
     file = tmp_path / "p.yaml"
-    file.write_text("/**:\n  ros__parameters:\n    noise: 0.5\n    somebody: 1\n    use_sim_time: true\n"
-                    "/robot/estimator:\n  ros__parameters:\n    count: 7\n    speed: 2.0\n    surface: hill.yaml\n"
+    file.write_text("/**:\n  ros__parameters:\n    noise: 0.5\n    somebody: 1\n"
+                    "    use_sim_time: true\n"
+                    "/robot/estimator:\n  ros__parameters:\n    count: 7\n    speed: 2.0\n"
+                    "    surface: hill.yaml\n"
                     "other:\n  ros__parameters: {x: 1}\n")
     example, other = parameters_for([Example, Other], "estimator", file)
     assert other.speed == 2.0

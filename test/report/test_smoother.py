@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion import cli
 from imu_fusion.estimation.smoother import SmootherParams
+from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report import smoother as report
 from imu_fusion.report.html import Figure, Table, render_report
-from imu_fusion.report.recording import read_contents, smooth_recording, write_recording_report
+from imu_fusion.report.contents import read_contents, smooth_recording
+from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.smoother import Smoothed, interpolate, smoother_sections
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
 from test.report.test_report import Page
@@ -106,7 +108,7 @@ def test_fixes_are_compared_at_the_time_and_place_of_the_antenna():
     delay = (np.full((101, 1), 0.1), np.full((101, 1), 0.01))
     result = SimpleNamespace(samples=samples, states={"gnss_time_offset": delay},
                              frame=LocalFrame(47.0, 11.0, 500.0))
-    params = SmootherParams(gnss_lever_arm=(0.0, 2.0, 0.0))
+    params = SmootherParams(gnss=Gnss(lever_arm=(0.0, 2.0, 0.0)))
     smoothed = Smoothed(result, params, None, None, None, 0)
     np.testing.assert_allclose(smoothed.antenna(np.array([500_000_000])), [[4.0, 2.0, 0.0]],
                                atol=1e-9)
@@ -151,7 +153,7 @@ def test_report_from_the_command_line_is_bounded_and_refusals_are_told(tmp_path)
     assert {"Trajectory", "Jump", "Orientation", "Error against the reference"} <= set(headings)
     assert out.stat().st_size < 11e6
     params = tmp_path / "p.yaml"
-    params.write_text("smoother: {ros__parameters: {gyro_noise_density: 1.0e-9}}")
+    params.write_text("smoother: {ros__parameters: {sensor.gyro_noise_density: 1.0e-10}}")
     result = CliRunner().invoke(cli.cli, ["report", str(BAG), "--params-file", str(params)])
     assert result.exit_code == 1 and "gyro_noise_density" in result.output
 

@@ -13,15 +13,36 @@ from typing import NamedTuple
 import numpy as np
 
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
-from imu_fusion.estimation.acceleration_field.motion_model import (ACC, ACC_RATE, ALPHA, BIAS, JERK,
-                                                                   OMEGA, THETA, gap_variance)
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ACC,
+    ACC_RATE,
+    ALPHA,
+    BIAS,
+    JERK,
+    OMEGA,
+    THETA,
+    gap_variance,
+)
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
-from imu_fusion.estimation.acceleration_field.rows import (GAP, HELD, MISSING, ROW, SATURATED,
-                                                           put_row, rigid_gradient)
+from imu_fusion.estimation.acceleration_field.rows import (
+    GAP,
+    HELD,
+    MISSING,
+    ROW,
+    SATURATED,
+    put_row,
+    rigid_gradient,
+)
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
-                                          right_jacobian, skew)
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_to_matrix,
+    right_jacobian,
+    skew,
+)
 from imu_fusion.kernels import njit
 
 #: What is carried from sample to sample, body axes: quaternion of the world from the body; omega,

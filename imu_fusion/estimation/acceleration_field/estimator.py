@@ -19,14 +19,15 @@ from numpy.typing import ArrayLike
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.acceleration_field.affine import AffineFilter
 from imu_fusion.estimation.acceleration_field.maximum_likelihood import fit_densities
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+)
 from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter
 from imu_fusion.estimation.acceleration_field.rigid_body_smoother import smooth
 from imu_fusion.estimation.acceleration_field.rows import ROW
 from imu_fusion.estimation.acceleration_field.sensor_array import make_sensor_array
-from imu_fusion.estimation.acceleration_field.start import (Start, given_start, is_still,
-                                                            rest_start)
+from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
 
 
 class AccelerationFieldEstimator:
@@ -126,12 +127,11 @@ class AccelerationFieldEstimator:
         if self.params.mode != "smoothed" or not self._stamps:
             return np.empty(0, ROW)
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
-        params, start = self.params, self._start
+        params = self.params
         if params.maximum_likelihood != "off":
             params = fit_densities(params, self.array, self._make_start, stamp, readings)
-            start = self._make_start(params)
             self.fitted = params
-        rows = smooth(params, self.array, start, stamp, readings)
+        rows = smooth(params, self.array, self._make_start(params), stamp, readings)
         self.reset()
         return rows
 

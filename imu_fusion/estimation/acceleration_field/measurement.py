@@ -10,10 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.acceleration_field.motion_model import ACC, ALPHA, BIAS, OMEGA
 from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED
+from imu_fusion.kernels import njit
 
 # States that one channel touches: omega, alpha, a and its own bias.
 TOUCHED = 10

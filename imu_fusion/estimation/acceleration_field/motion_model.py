@@ -12,11 +12,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
-                                          right_jacobian)
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_to_matrix,
+    right_jacobian,
+)
+from imu_fusion.kernels import njit
 
 # Where the members of Parts begin. theta, omega, alpha and jerk of an axis are a chain of
 # integrators, as are acc and acc_rate.
@@ -218,9 +223,9 @@ def _add_noise(cov, p, channels, step):
     q = p.motion.acceleration_rate_density * p.motion.acceleration_rate_density
     for i in range(3):
         for k in range(4):
-            for l in range(4):
-                cov[THETA + 3 * k + i, THETA + 3 * l + i] += (
-                    jerk_density * jerk_density * step.noise[k, l])
+            for j in range(4):
+                cov[THETA + 3 * k + i, THETA + 3 * j + i] += (
+                    jerk_density * jerk_density * step.noise[k, j])
         cov[ACC + i, ACC + i] += q * dt ** 3 / 3.0
         cov[ACC + i, ACC_RATE + i] += 0.5 * q * dt * dt
         cov[ACC_RATE + i, ACC + i] += 0.5 * q * dt * dt

@@ -4,17 +4,27 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import Trace, make_trace, update
 from imu_fusion.estimation.acceleration_field.motion_model import (
-    ALPHA, BIAS, OMEGA, THETA, State, Step, motion_step, parts, predict, reopen)
+    ALPHA,
+    BIAS,
+    OMEGA,
+    THETA,
+    State,
+    Step,
+    motion_step,
+    parts,
+    predict,
+    reopen,
+)
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_row, rigid_gradient
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
+from imu_fusion.kernels import njit
 
 
 @njit
@@ -63,9 +73,10 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace):
     """
     p = par[0]
     step = _make_step()
+    only = np.int64(0)   # a literal 0 would compile what is called once more
     for n in range(len(stamp)):
-        flags = _predict_to(stamp[n], state, p, channels, step, trace, 0)
-        found = update(state, p, channels, readings[n], state.x[OMEGA:ALPHA].copy(), trace, 0)
+        flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
+        found = update(state, p, channels, readings[n], state.x[OMEGA:ALPHA].copy(), trace, only)
         _fold(state)
         flags |= found.flags
         residual = math.nan

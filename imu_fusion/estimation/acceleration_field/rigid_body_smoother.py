@@ -3,20 +3,37 @@
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
-    TOUCHED, Trace, channel_row, make_trace, noise_variance)
+    TOUCHED,
+    Trace,
+    channel_row,
+    make_trace,
+    noise_variance,
+)
 from imu_fusion.estimation.acceleration_field.motion_model import (
-    ALPHA, BIAS, motion_step, multiply_transition_transposed, parts, transition)
+    ALPHA,
+    BIAS,
+    motion_step,
+    multiply_transition_transposed,
+    parts,
+    transition,
+)
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter
-from imu_fusion.estimation.acceleration_field.rows import (GAP, MISSING, ROW, SATURATED, put_row,
-                                                           rigid_gradient)
+from imu_fusion.estimation.acceleration_field.rows import (
+    GAP,
+    MISSING,
+    ROW,
+    SATURATED,
+    put_row,
+    rigid_gradient,
+)
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
+from imu_fusion.kernels import njit
 
 #: Samples whose covariances are kept at a time; others are filtered again when needed.
 CHUNK = 256
@@ -87,8 +104,8 @@ def _before_update(adjoint, channels, trace, n):
                 information[i, j] -= h * spread[j]
                 information[j, i] -= h * spread[j]
         for k in range(count):
-            for l in range(count):
-                information[index[k], index[l]] += row[k] * row[l] * quadratic
+            for j in range(count):
+                information[index[k], index[j]] += row[k] * row[j] * quadratic
 
 
 def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, stamp: np.ndarray,

@@ -7,8 +7,14 @@ X is ``P X + value`` (Rahaman 2019, eq. (2.35)); see :func:`field_at`.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from imu_fusion.estimation.acceleration_field.motion_model import (ACC, ALPHA, BIAS, JERK, OMEGA,
-                                                                   THETA)
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ACC,
+    ALPHA,
+    BIAS,
+    JERK,
+    OMEGA,
+    THETA,
+)
 from imu_fusion.geometry.rotation import quat_to_matrix, skew
 from imu_fusion.kernels import njit
 

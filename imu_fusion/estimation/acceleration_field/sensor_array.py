@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from imu_fusion.errors import LayoutError
-from imu_fusion.estimation.acceleration_field.params import (AXIS_NAMES, AccelerometerParams,
-                                                             Sensor)
+from imu_fusion.estimation.acceleration_field.params import AXIS_NAMES, AccelerometerParams, Sensor
 
 # Order of the six numbers of the symmetric part: xx yy zz xy xz yz.
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

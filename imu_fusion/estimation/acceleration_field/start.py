@@ -7,7 +7,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.acceleration_field.motion_model import (
-    ACC, ACC_RATE, ALPHA, BIAS, OMEGA, THETA, motion_spread, parts)
+    ACC,
+    ACC_RATE,
+    ALPHA,
+    BIAS,
+    OMEGA,
+    THETA,
+    motion_spread,
+    parts,
+)
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.geometry.rotation import skew

@@ -45,7 +45,7 @@ def find_jump(imu, velocity, takeoff=None, touchdown=None):
                   for given, detected in zip(stamps, (found.takeoff, found.touchdown))]
     if stamps[1] <= stamps[0]:
         raise EstimationError("the touch-down that was detected is before the take-off that was "
-                              "given, or the reverse: give both (takeoff, touchdown)")
+                              "given, or the reverse: give both (jump.takeoff, jump.touchdown)")
     return JumpEvents(*stamps)
 
 
@@ -67,7 +67,7 @@ def detect_jump(imu, velocity):
         velocity = velocity[np.isfinite(velocity.vel_world).all(axis=1)]
     if velocity is None or len(velocity) < 2:
         raise EstimationError("take-off and touch-down cannot be detected without GNSS "
-                              "velocities: give them (parameters takeoff and touchdown)")
+                              "velocities: give them (jump.takeoff and jump.touchdown)")
     origin = imu.stamp[0]
     speed = np.interp(imu.stamp - origin, velocity.stamp - origin,
                       np.linalg.norm(velocity.vel_world, axis=1))
@@ -75,7 +75,7 @@ def detect_jump(imu, velocity):
     fast = (speed > _MIN_SPEED) & np.isfinite(force)
     if not fast.any():
         raise EstimationError(f"no take-off: the speed never exceeds {_MIN_SPEED:g} m/s "
-                              "(parameters takeoff and touchdown give it)")
+                              "(jump.takeoff and jump.touchdown give it)")
     candidates = np.where(fast, force, -np.inf)
     first = int(np.argmax(candidates))
     # (A2), with the sense of the inequality that the text describes.
@@ -84,7 +84,7 @@ def detect_jump(imu, velocity):
     second = int(np.argmax(candidates))
     if not np.isfinite(candidates[second]):
         raise EstimationError("no take-off and touch-down: only one peak of the specific force "
-                              "at speed (parameters takeoff and touchdown give them)")
+                              "at speed (jump.takeoff and jump.touchdown give them)")
     early, late = sorted((int(imu.stamp[first]), int(imu.stamp[second])))
     return JumpEvents(early, late - int(_LEAD * 1e9))
 
@@ -229,7 +229,7 @@ def jump_result(hill, samples, imu, events):
     if x <= 0.0:
         raise EstimationError(f"at touch-down the smoothed trajectory is {-x:.1f} m before the "
                               "edge of the table: take-off and touch-down are taken wrongly "
-                              "(parameters takeoff and touchdown give them), or the hill is "
+                              "(jump.takeoff and jump.touchdown give them), or the hill is "
                               "another one")
     onset = impact_onset(imu, events.touchdown)
     timing = onset[1] if onset is not None else _LEAD

@@ -61,8 +61,8 @@ class _Data:
 
 class ExtendedRts:
     """Runs like :class:`~imu_fusion.estimation.smoother.Smoother`. Takes noise and ranges of the
-    inputs, gravity, field, events, windows and the choice of readings (``gnss_even_stamps``,
-    ``gnss_min_interval``) from its parameters, all else from the paper: tables 3 and 5 rather
+    inputs, gravity, field, events, windows and the choice of readings (``gnss.even_stamps``,
+    ``gnss.min_interval``) from its parameters, all else from the paper: tables 3 and 5 rather
     than the covariances of fixes and velocities. Clipped readings are used as they are, with the
     noise of unknown ones.
     """
@@ -87,7 +87,7 @@ class ExtendedRts:
         prepared = prepare_imu(imu, params)
         frame = reference_frame(hill, fix)
         if hill is not None and events is None:
-            events = find_jump(prepared.log, velocity, params.takeoff, params.touchdown)
+            events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
         measurements = prepare_measurements(frame, mag, fix, velocity, params)
         gravity, field = params.gravity, params.magnetic_field
         if gravity is None:
@@ -109,8 +109,9 @@ class ExtendedRts:
             samples, mag_errors, mag_sd = (v[prepared.recorded]
                                            for v in (samples, mag_errors, mag_sd))
         noise = reading_variances(samples["stamp"], params)
-        lost = noise * np.square([params.unknown_gyro_density / params.gyro_noise_density,
-                                  params.unknown_acc_density / params.acc_noise_density])
+        lost = noise * np.square([
+            params.gap.gyro_noise_density / params.sensor.gyro_noise_density,
+            params.gap.acc_noise_density / params.sensor.acc_noise_density])
         for i, name in enumerate(("gyr", "acc")):
             clipped = prepared.clipped[prepared.recorded, 3 * i:3 * i + 3]
             samples[name + "_sd"] = np.sqrt(samples[name + "_bias_sd"] ** 2
@@ -122,9 +123,7 @@ class ExtendedRts:
                        for kind, name in _NAMES.items()}
         jump = jump_result(hill, samples, prepared.log, events) if hill is not None else None
         constraints = () if hill is None else hill.constraints()
-        # The paper holds the sensor itself on the hill.
-        at_sensor = params.replace(surface_lever_arm=(0.0, 0.0, 0.0))
-        fits = surface_fits(constraints, samples, states, events, at_sensor)
+        fits = surface_fits(constraints, samples, states, events, params)
         return SmootherResult(samples, frame, states, innovations, (cost,), 1, None, events, jump,
                               fits)
 
@@ -154,8 +153,8 @@ def _bind(model, prepared, measurements, events, params):
     value[kind == FIX] = value[kind == FIX] @ model.axes.T
     value[kind == VELOCITY] = value[kind == VELOCITY] @ ENU_NED.T
     constraints = model.hill.constraints() if model.hill is not None else ()
-    strict = params.replace(event_margin=0.0)
-    active = {c.name: holds(c, log.stamp, events, strict) for c in constraints}
+    active = {c.name: holds(c, log.stamp, events, params.surface.windows, 0.0)
+              for c in constraints}
     sigma = {"norm": np.sqrt(_R_NORM), **{c.name: c.sigma for c in constraints}}
     return _Data(log.stamp, np.concatenate([log.gyr, log.acc], axis=1), prepared.steps,
                  prepared.noise, order, np.searchsorted(sample[order], np.arange(len(log) + 1)),

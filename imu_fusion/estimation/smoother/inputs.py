@@ -86,7 +86,7 @@ def prepare_imu(imu, params):
         raise SampleError(f"{len(imu)} usable Imu samples: the smoother needs at least 10")
     steps = np.diff(imu.stamp)
     nominal = int(np.median(steps))
-    gaps = np.flatnonzero(steps > max(params.max_gap * 1e9, 1.5 * nominal))
+    gaps = np.flatnonzero(steps > max(params.gap.max * 1e9, 1.5 * nominal))
     recorded = np.ones(len(imu), bool)
     if len(gaps):
         extra = [np.arange(imu.stamp[g] + nominal, imu.stamp[g + 1] - nominal // 2, nominal)
@@ -101,12 +101,14 @@ def prepare_imu(imu, params):
         imu = ImuLog(stamp=stamp[order], gyr=columns[0], acc=columns[1], frame_id=imu.frame_id)
     sides, clipped = [], []
     for values, limit, density, unknown in (
-            (imu.gyr, params.gyro_range, params.gyro_noise_density, params.unknown_gyro_density),
-            (imu.acc, params.acc_range, params.acc_noise_density, params.unknown_acc_density)):
+            (imu.gyr, params.sensor.gyro_range, params.sensor.gyro_noise_density,
+             params.gap.gyro_noise_density),
+            (imu.acc, params.sensor.acc_range, params.sensor.acc_noise_density,
+             params.gap.acc_noise_density)):
         lost = np.repeat(~recorded[:, None], 3, axis=1)
-        if limit > 0.0:
+        if limit is not None:
             # One part in a thousand below the limit: rounding of logged full-scale values.
-            lost |= np.abs(values) >= 0.999 * limit
+            lost |= np.abs(values) >= 0.999 * np.array(limit)
         clipped.append(lost & recorded[:, None])
         either = lost[1:] | lost[:-1]
         sides.append(np.where(either, unknown, density) ** 2)
@@ -161,12 +163,12 @@ def _roots(given, default_sd, params, what):
         SampleError: a covariance that is not positive definite.
     """
     cov = given.copy()
-    unknown = ~np.any(cov, axis=(1, 2)) | (not params.gnss_covariances)
+    unknown = ~np.any(cov, axis=(1, 2)) | (not params.gnss.covariances)
     cov[unknown] = np.diag(np.square(default_sd))
     try:
         return np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
-        raise SampleError(f"a covariance of {what} is not positive definite (gnss_covariances: "
+        raise SampleError(f"a covariance of {what} is not positive definite (gnss.covariances: "
                           "false takes those of the parameters instead)") from None
 
 
@@ -203,7 +205,7 @@ def even_stamps(stamp):
     off = float(np.abs(even - seconds).max())
     if off >= 0.5 * slope:
         raise SampleError(f"GNSS stamps lie up to {off:.2f} s off even steps of {slope:.3f} s: "
-                          "they are not taken at an even rate (gnss_even_stamps: false)")
+                          "they are not taken at an even rate (gnss.even_stamps: false)")
     return stamp[0] + np.round(even * 1e9).astype(np.int64)
 
 
@@ -223,8 +225,8 @@ def spaced(stamp, interval):
 
 def _gnss_readings(log, params):
     """Readings (FixLog or VelocityLog) to use, and their stamps (m,) ns."""
-    stamp = even_stamps(log.stamp) if params.gnss_even_stamps else log.stamp
-    keep = spaced(stamp, params.gnss_min_interval)
+    stamp = even_stamps(log.stamp) if params.gnss.even_stamps else log.stamp
+    keep = spaced(stamp, params.gnss.min_interval)
     return log[keep], stamp[keep]
 
 
@@ -241,24 +243,25 @@ def prepare_measurements(frame, mag, fix, velocity, params):
         raise EstimationError(_NO_FIX)
     eye = np.eye(3)
     fix, stamp = _gnss_readings(fix, params)
-    root = _roots(fix.cov_enu, params.fix_sd, params, "the fixes")
+    root = _roots(fix.cov_enu, params.gnss.fix_sd, params, "the fixes")
     parts.append((stamp, FIX, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
-                  root, params.fix_loss_scale))
+                  root, params.gnss))
     if velocity is not None:
         velocity, stamp = _gnss_readings(
             velocity[np.isfinite(velocity.vel_world).all(axis=1)], params)
-        root = _roots(velocity.cov_world, params.velocity_sd, params, "the velocities")
-        parts.append((stamp, VELOCITY, velocity.vel_world, root, params.fix_loss_scale))
+        root = _roots(velocity.cov_world, params.gnss.velocity_sd, params, "the velocities")
+        parts.append((stamp, VELOCITY, velocity.vel_world, root, params.gnss))
     if mag is not None:
         mag = mag[np.isfinite(mag.mag).all(axis=1)]
-        root = np.broadcast_to(params.mag_sd * _MICRO * eye, (len(mag), 3, 3))
-        parts.append((mag.stamp, MAG, mag.mag * _MICRO, root, params.mag_loss_scale))
+        root = np.broadcast_to(params.sensor.mag_noise_sd * _MICRO * eye, (len(mag), 3, 3))
+        parts.append((mag.stamp, MAG, mag.mag * _MICRO, root, params.mag))
     whiten = np.concatenate([np.linalg.inv(p[3]) for p in parts])
     return Measurements(
         stamp=np.concatenate([p[0] for p in parts]),
         kind=np.concatenate([np.full(len(p[0]), p[1]) for p in parts]),
         value=np.concatenate([p[2] for p in parts]), whiten=np.tril(whiten),
-        loss=np.concatenate([np.full(len(p[0]), p[4] ** 2) for p in parts]))
+        loss=np.concatenate([np.full(len(p[0]), p[4].loss_scale ** 2 if p[4].loss == "cauchy" else np.inf)
+                             for p in parts]))
 
 
 def surface_points(position_world, quat_world_imu, lever_imu):
@@ -292,20 +295,23 @@ def lever_gradient(start, gradient, quat_world_imu, lever_imu):
     return np.cross(lever, along), along
 
 
-def holds(constraint, stamp, events, params):
+def holds(constraint, stamp, events, windows, margin):
     """Mask (N,) of the samples at which a constraint holds: its phase of a jump, and the windows.
 
-    Args: as of :func:`evaluate_constraints`.
+    Args:
+        constraint, stamp, events: as of :func:`evaluate_constraints`.
+        windows: s since the first stamp, start and stop in turn; empty: always.
+        margin: s around the events in which heights are free.
     """
-    late = np.int64(round(params.event_margin * 1e9)) if constraint.height else np.int64(0)
+    late = np.int64(round(margin * 1e9)) if constraint.height else np.int64(0)
     active = np.ones(len(stamp), bool)
     if constraint.phase == "in_run":
         active = stamp <= events.takeoff - late
     elif constraint.phase == "landing":
         active = stamp >= events.touchdown + late
-    if params.surface_windows:
+    if windows:
         # An odd number of bounds passed: inside of a window.
-        bounds = np.round(np.array(params.surface_windows) * 1e9).astype(np.int64)
+        bounds = np.round(np.array(windows) * 1e9).astype(np.int64)
         active = active & (np.searchsorted(bounds, stamp - stamp[0], side="right") % 2 == 1)
     return active
 
@@ -314,14 +320,14 @@ def evaluate_constraints(constraints, position_world, stamp, events, params):
     """Rows of all constraints on the samples where they hold.
 
     A row of every sample says as much per second at any rate of the Imu: the standard deviation
-    of a constraint is that of rows ``surface_interval`` apart.
+    of a constraint is that of rows ``surface.interval`` apart.
 
     Args:
         constraints: of the surface.
         position_world: (N, 3) m, in the frame of the surface, of the points held on it.
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
-        params: SmootherParams; ``event_margin`` around the events heights are free.
+        params: SmootherParams; ``jump.event_margin`` around the events heights are free.
 
     Returns:
         start (N + 1,), residual (r,), gradient (r, 3), sigma (r,), height (r,).
@@ -329,10 +335,11 @@ def evaluate_constraints(constraints, position_world, stamp, events, params):
     pieces = []
     # Samples beside a gap do not speak for it.
     step = np.gradient(stamp - stamp[0])
-    step = np.minimum(step, max(params.max_gap * 1e9, 1.5 * np.median(step)))
-    share = np.sqrt(params.surface_interval * 1e9 / step)
+    step = np.minimum(step, max(params.gap.max * 1e9, 1.5 * np.median(step)))
+    share = np.sqrt(params.surface.interval * 1e9 / step)
     for constraint in constraints:
-        sample = np.flatnonzero(holds(constraint, stamp, events, params))
+        sample = np.flatnonzero(holds(constraint, stamp, events, params.surface.windows,
+                                      params.jump.event_margin))
         if not len(sample):
             continue
         residual, gradient = constraint.evaluate(position_world[sample])

@@ -55,7 +55,7 @@ class Problem:
                 columns += range(self.layout[block], self.layout[block] + width)
         self.motion = (self.imu.steps, self.imu.means, self.imu.noise, self.gravity,
                        self.earth_rate, self.decay_rate, self.walk, self.layout, np.array(columns),
-                       self.field_world, np.array(self.params.gnss_lever_arm))
+                       self.field_world, np.array(self.params.gnss.lever_arm))
         self.size = n
         self.attach()
         no_rows = np.zeros(len(self.imu.log) + 1, np.int64)
@@ -123,20 +123,22 @@ class Problem:
     def _surface_lever(self):
         """Lever arm (3,) or (N, 3) m of the point that is held on the surface."""
         i = self.layout[model.SURFACE_ARM]
-        return self.params.surface_lever_arm if i < 0 else self.x[:, i + 1:i + 4]
+        return self.params.surface.lever_arm if i < 0 else self.x[:, i + 1:i + 4]
 
     def surface_points(self):
         """Points (N, 3) m of the trajectory that are held on the surface."""
         return surface_points(self.x[:, 0:3], self.x[:, 6:10], self._surface_lever())
 
     def _constraint_rows(self, events):
-        start, residual, gradient, *others = evaluate_constraints(
+        start, residual, gradient, sigma, height = evaluate_constraints(
             self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params)
         state, lever = self.layout[model.SURFACE_ARM] >= 0, self._surface_lever()
         if state or np.any(lever):
             turned, along = lever_gradient(start, gradient, self.x[:, 6:10], lever)
             gradient = np.hstack([gradient, turned, along] if state else [gradient, turned])
-        return start, residual, gradient, *others
+        if self.layout[model.BODY_HEIGHT] < 0:
+            residual = residual - np.where(height, self.params.surface.body_height, 0.0)
+        return start, residual, gradient, sigma, height
 
     def step(self, events, with_cov=False):
         """One Gauss-Newton step; moves x.
@@ -195,12 +197,12 @@ def solve(problem, events, refine):
     refined, converged, steps, changed = events is None, False, 0, 0
     near, covariances, variances = False, (), ()
     binding = moving
-    while steps < params.max_iterations:
+    while steps < params.iteration.max:
         if moving:
             problem.attach(binding)
         largest, covariances, variances = problem.step(events, with_cov=near)
         steps += 1
-        near = refined and not held and largest.max() <= _NEAR * params.tolerance
+        near = refined and not held and largest.max() <= _NEAR * params.iteration.tolerance
         if not np.isfinite(problem.cost[-1] + largest.sum()):
             break
         # A cost is that before its step: the first two after a change cannot be compared.
@@ -215,8 +217,8 @@ def solve(problem, events, refine):
         if held and change <= _SETTLED * problem.cost[-1]:
             problem.prior_sd, held, changed = prior_sd, False, len(problem.cost)
             continue
-        still = change <= params.cost_tolerance
-        if held or (largest.max() > params.tolerance and not still):
+        still = change <= params.iteration.cost_tolerance
+        if held or (largest.max() > params.iteration.tolerance and not still):
             continue
         if refined:
             converged = True

@@ -49,7 +49,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
             the slow states; layout; columns of the transition matrix in use; magnetic field
             (3,); lever arm (3,).
         measured: sorted by sample: start (N + 1,), kind, tau, value (M, 3), whitening matrix
-            (M, 3, 3), squared scale of the robust loss (0: squared loss).
+            (M, 3, 3), squared scale of the robust loss (inf: squared loss).
         rows: constraints sorted by sample: start (N + 1,), residual, gradient (r, 3), sigma,
             height. Where not the sensor itself is held on the surface, the gradient goes on with
             the derivatives to the attitude (r, 6) and the surface lever arm (r, 9).
@@ -125,7 +125,7 @@ def filter_segment(first, last, follow, x, delta, cov, motion, measured, rows, i
                                 scale += h[i, a] * cov[a, b] * h[i, b]
                 squares += residual[i] * residual[i] / scale
             weight = 1.0
-            if m_loss[m] > 0.0:
+            if m_loss[m] < np.inf:
                 weight = 1.0 / math.sqrt(1.0 + squares / m_loss[m])
                 cost += m_loss[m] * math.log(1.0 + squares / m_loss[m])
             else:

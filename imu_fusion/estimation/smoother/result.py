@@ -23,13 +23,13 @@ _SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
 _CAUSES = {
-    "fix": "the covariances of the messages (gnss_covariances: false) or fix_sd may be too small, "
-           "the stamps late (gnss_time_offset_sd: 0.2 finds it) or the errors wander "
-           "(gnss_position_error_sd)",
-    "velocity": "the covariances of the messages (gnss_covariances: false) or velocity_sd may be "
-                "too small, the stamps late (velocity_time_offset_sd: 0.2 finds it) or filtered "
-                "(gnss_velocity_error_sd, gnss_min_interval)",
-    "mag": "the field may be disturbed, or mag_sd, mag_bias_sd and mag_scale_sd too small"}
+    "fix": "the covariances of the messages (gnss.covariances: false) or gnss.fix_sd may be too small, "
+           "the stamps late (gnss.time_offset_sd: 0.2 finds it) or the errors wander "
+           "(gnss.position_error_sd)",
+    "velocity": "the covariances of the messages (gnss.covariances: false) or gnss.velocity_sd may be "
+                "too small, the stamps late (gnss.velocity_time_offset_sd: 0.2 finds it) or filtered "
+                "(gnss.velocity_error_sd, gnss.min_interval)",
+    "mag": "the field may be disturbed, or sensor.mag_noise_sd, mag_bias_sd and mag_scale_sd too small"}
 
 
 def reading_variances(stamp, params):
@@ -39,7 +39,8 @@ def reading_variances(stamp, params):
         stamp: (n,) ns. params: SmootherParams.
     """
     rate = 1e9 / np.median(np.diff(stamp))
-    return rate * np.square([params.gyro_noise_density, params.acc_noise_density])
+    return rate * np.square([params.sensor.gyro_noise_density,
+                              params.sensor.acc_noise_density])
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class SmootherResult:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "
                          + "/".join(f"{b:+.1f}" for b in beside) + " (east/north/up) of their "
                          "standard deviations: the origin of the surface may be off, the sensor "
-                         "ride above it (body_height) or the fixes wander (gnss_position_error_sd)")
+                         "ride above it (surface.body_height) or the fixes wander (gnss.position_error_sd)")
         for name, fit in self.surface.items():
             if fit.silent > _SILENT:
                 texts.append(f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of "
@@ -137,6 +138,6 @@ class SmootherResult:
                     f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "
                     f"largest {fit.largest:.2f} m), over seconds {fit.excess:.1f} times as much as "
                     f"its sigma of {fit.sigma:g} m allows: the surface may be another than the one "
-                    "given, or the sensor move against it (a larger sigma or surface_interval, "
-                    "body_height_sd)")
+                    "given, or the sensor move against it (a larger sigma or surface.interval, "
+                    "surface.body_height_sd)")
         return texts

@@ -57,7 +57,7 @@ class Smoother:
         frame = reference_frame(surface, fix)
         constraints = surface.constraints() if surface is not None else ()
         if events is None and any(c.phase != "always" for c in constraints):
-            events = find_jump(prepared.log, velocity, params.takeoff, params.touchdown)
+            events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
         measurements = prepare_measurements(frame, mag, fix, velocity, params)
         problem = self._problem(prepared, frame, measurements, constraints, fix)
         hill = surface if isinstance(surface, Hill) and events is not None else None
@@ -84,27 +84,27 @@ class Smoother:
     def _problem(self, prepared, frame, measurements, constraints, fix):
         p = self.params
         has_mag = bool(np.any(measurements.kind == model.MAG))
-        wander, drift = np.array(p.gnss_position_error_sd), np.array(p.gnss_velocity_error_sd)
-        blocks = {"mag_bias": [p.mag_bias_sd * 1e6] * 3 if has_mag else 0,
-                  "mag_scale": [p.mag_scale_sd] * 3 if has_mag else 0,
+        wander, drift = np.array(p.gnss.position_error_sd), np.array(p.gnss.velocity_error_sd)
+        blocks = {"mag_bias": [p.sensor.mag_bias_sd * 1e6] * 3 if has_mag else 0,
+                  "mag_scale": [p.sensor.mag_scale_sd] * 3 if has_mag else 0,
                   "gnss_position_error": wander if wander.any() else 0,
-                  "gnss_time_offset": [p.gnss_time_offset_sd],
-                  "velocity_time_offset": [p.velocity_time_offset_sd],
-                  "acc_matrix": [p.acc_matrix_sd] * 9,
-                  "gyr_scale": [p.gyro_scale_sd] * 3, "gnss_lever_arm": [p.gnss_lever_arm_sd] * 3,
-                  "body_height": [p.body_height_sd],
-                  "surface_lever_arm": [p.surface_lever_arm_sd] * 3,
+                  "gnss_time_offset": [p.gnss.time_offset_sd],
+                  "velocity_time_offset": [p.gnss.velocity_time_offset_sd],
+                  "acc_matrix": [p.sensor.acc_matrix_sd] * 9,
+                  "gyr_scale": [p.sensor.gyro_scale_sd] * 3, "gnss_lever_arm": [p.gnss.lever_arm_sd] * 3,
+                  "body_height": [p.surface.body_height_sd],
+                  "surface_lever_arm": [p.surface.lever_arm_sd] * 3,
                   "gnss_velocity_error": drift if drift.any() else 0}
         present = {name: sd for name, sd in blocks.items() if np.any(sd)}
         layout, size = model.make_layout(present)
-        sd = np.concatenate([[p.position_sd] * 3, [p.speed_sd] * 3, [p.attitude_sd] * 3,
-                             [p.gyro_bias_sd] * 3, [p.acc_bias_sd] * 3,
+        sd = np.concatenate([[p.initial.position_sd] * 3, [p.initial.speed_sd] * 3, [p.initial.attitude_sd] * 3,
+                             [p.sensor.gyro_bias_sd] * 3, [p.sensor.acc_bias_sd] * 3,
                              *(present[name] for name, _ in model.BLOCKS if name in present)])
         decay, walk = np.zeros(size), np.zeros(size)
-        walk[model.GYR_BIAS:model.GYR_BIAS + 3] = p.gyro_bias_walk ** 2
-        walk[model.ACC_BIAS:model.ACC_BIAS + 3] = p.acc_bias_walk ** 2
-        for block, spread, tau in ((model.GNSS_ERROR, wander, p.gnss_position_error_tau),
-                                   (model.GNSS_VELOCITY_ERROR, drift, p.gnss_velocity_error_tau)):
+        walk[model.GYR_BIAS:model.GYR_BIAS + 3] = p.sensor.gyro_bias_walk ** 2
+        walk[model.ACC_BIAS:model.ACC_BIAS + 3] = p.sensor.acc_bias_walk ** 2
+        for block, spread, tau in ((model.GNSS_ERROR, wander, p.gnss.position_error_tau),
+                                   (model.GNSS_VELOCITY_ERROR, drift, p.gnss.velocity_error_tau)):
             i = layout[block]
             if i >= 0:
                 decay[i:i + 3] = 1.0 / tau
@@ -140,15 +140,15 @@ class Smoother:
         # A fifth of a second: long enough against noise, short against motion.
         beginning = int(np.searchsorted(log.stamp, log.stamp[0] + 200_000_000))
         acc = log.acc[:beginning].mean(axis=0)
-        for block, lever in ((model.LEVER_ARM, p.gnss_lever_arm),
-                             (model.SURFACE_ARM, p.surface_lever_arm)):
+        for block, lever in ((model.LEVER_ARM, p.gnss.lever_arm),
+                             (model.SURFACE_ARM, p.surface.lever_arm)):
             i = problem.layout[block]
             if i >= 0:
                 prior[i + 1:i + 4] = lever
         i = problem.layout[model.BODY_HEIGHT]
         problem.prior, problem.x = prior, np.empty((len(log), size + 1))
         if i >= 0:
-            prior[i + 1] = p.body_height
+            prior[i + 1] = p.surface.body_height
         # Quarter turns insure against a disturbed or mounted-over magnetometer.
         candidates = 4
         if initial_quat is None:
@@ -238,8 +238,8 @@ def _recover_clipped(samples, problem):
     ends = (samples["cov_attitude"][row[inner]].diagonal(0, 1, 2),
             np.einsum("nji,njk,nki->ni", turn, cov_velocity, turn))
     for name, value, end, unknown, lost in (
-            ("gyr", rate, ends[0], p.unknown_gyro_density, clipped[inner, 0:3]),
-            ("acc", force, ends[1], p.unknown_acc_density, clipped[inner, 3:6])):
+            ("gyr", rate, ends[0], p.gap.gyro_noise_density, clipped[inner, 0:3]),
+            ("acc", force, ends[1], p.gap.acc_noise_density, clipped[inner, 3:6])):
         sd = np.sqrt(np.minimum(2.0 * end / span ** 2, unknown ** 2 / span))
         for field, new in ((name, value), (name + "_sd", sd)):
             samples[field][row[inner]] = np.where(lost, new, samples[field][row[inner]])

@@ -16,7 +16,7 @@ class SurfaceFit:
     """Deviations from one constraint: ``sample`` (r,) index where it holds, ``residual`` (r,) m
     less the body's height, their RMS ``rms`` m, ``largest`` m, ``sigma`` m of the surface.
 
-    ``excess``: RMS of the means over stretches of a second (``surface_interval`` if longer), by
+    ``excess``: RMS of the means over stretches of a second (``surface.interval`` if longer), by
     the standard deviation that sigma gives such a mean. The smoother pulls the trajectory to
     the surface, so a surface that fits leaves less than 1.
     ``silent``: share of the samples at which the constraint should hold, but the surface says
@@ -43,7 +43,7 @@ def at_surface(samples, states, params):
         samples, states: of the SmootherResult.
         params: SmootherParams.
     """
-    lever, lever_sd = states.get("surface_lever_arm", (np.array(params.surface_lever_arm), 0.0))
+    lever, lever_sd = states.get("surface_lever_arm", (np.array(params.surface.lever_arm), 0.0))
     if not np.any(lever):
         return samples
     lever = np.broadcast_to(lever, samples["position_world"].shape)
@@ -87,19 +87,21 @@ def surface_fits(constraints, samples, states, events, params):
         if not len(residual):
             continue
         sample = np.repeat(np.arange(len(samples)), np.diff(start))
+        active = holds(constraint, samples["stamp"], events, params.surface.windows,
+                       params.jump.event_margin)
         if constraint.height:
             height = states["body_height"][0][sample, 0] if "body_height" in states \
-                else params.body_height
+                else params.surface.body_height
             residual = residual - height
         fits[constraint.name] = SurfaceFit(
             sample, residual, constraint.sigma, float(np.sqrt(np.mean(residual ** 2))),
             float(np.abs(residual).max()),
-            _excess(samples["stamp"][sample], residual, sigma, params.surface_interval),
-            1.0 - len(residual) / holds(constraint, samples["stamp"], events, params).sum())
+            _excess(samples["stamp"][sample], residual, sigma, params.surface.interval),
+            1.0 - len(residual) / active.sum())
     if constraints and not fits:
         raise EstimationError("the surface says nothing at any sample of this recording: an "
                               "elevation grid must reach the trajectory (see its crs and extent), "
-                              "surface_windows must lie within the recording")
+                              "surface.windows must lie within the recording")
     return fits
 
 

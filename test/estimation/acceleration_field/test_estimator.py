@@ -6,14 +6,23 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, LayoutError, SampleError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams, Initial)
-from imu_fusion.estimation.acceleration_field.rows import (GAP, HELD, MISSING, SATURATED,
-                                                           field_at)
-from imu_fusion.estimation.acceleration_field.sensor_array import (make_sensor_array,
-                                                                   nine_accelerometer_package)
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
-                                                     ImpactScene, simulate)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
+from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, MISSING, SATURATED, field_at
+from imu_fusion.estimation.acceleration_field.sensor_array import (
+    make_sensor_array,
+    nine_accelerometer_package,
+)
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_PARTICLE,
+    PAPER_POSITIONS,
+    ImpactScene,
+    simulate,
+)
 
 GIVEN = AccelerationFieldParams(
     initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=1e-6),
@@ -67,7 +76,8 @@ def test_magnitude_of_the_field_needs_no_orientation(motion):
     readings = motion.readings(PAPER_POSITIONS, PAPER_AXES)
     turned = tuple(Rotation.from_rotvec([0.3, -1.0, 2.0]).as_quat())
     plain, other = (AccelerationFieldEstimator(
-        GIVEN.replace(**{"method": "ao", "initial.orientation": q}), sensors()).run(motion.stamp, readings)
+        GIVEN.replace(**{"method": "ao", "initial.orientation": q}), sensors()).run(
+            motion.stamp, readings)
         for q in ((0, 0, 0, 1), turned))
     assert np.array_equal(plain["specific_force"], other["specific_force"])
     force = field_at(plain, PAPER_PARTICLE, 9.8)[0][:, 0]
@@ -167,7 +177,10 @@ def test_live_batch_and_interrupted_runs_agree_bit_for_bit(motion, change):
     readings[40, 2] = np.nan
     stamp = motion.stamp[:300]
     params = GIVEN.replace(**change)
-    make = lambda: AccelerationFieldEstimator(params, sensors(noise_density=1e-2, bias_sd=0.1))
+
+    def make():
+        return AccelerationFieldEstimator(params, sensors(noise_density=1e-2, bias_sd=0.1))
+
     batch = make().run(stamp, readings)
     live = make()
     rows = [live.add(s, r) for s, r in zip(stamp[:120], readings[:120])]

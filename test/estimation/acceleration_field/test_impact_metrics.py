@@ -8,10 +8,22 @@ import pytest
 from imu_fusion.errors import SampleError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.impact_metrics import (
-    STANDARD_GRAVITY, ImpactParams, bric, channel_filter, damage, find_events, gambit, hic,
-    measure_impacts, sustained_level)
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams, Initial)
+    STANDARD_GRAVITY,
+    ImpactParams,
+    bric,
+    channel_filter,
+    damage,
+    find_events,
+    gambit,
+    hic,
+    measure_impacts,
+    sustained_level,
+)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 T = np.arange(2001) * 1e-4
@@ -116,7 +128,7 @@ def test_pyisomme_agrees():
 def test_events_have_pretrigger_and_do_not_overlap():
     magnitude = np.zeros_like(T)
     for at in (0.05, 0.08, 0.15):
-        magnitude[(T >= at - 1e-9) & (T < at + 0.002)] = 200.0
+        magnitude[(at - 1e-9 <= T) & (at + 0.002 > T)] = 200.0
     events = find_events(T, magnitude, ImpactParams(before=0.01, duration=0.06))
     assert [(T[e][0], T[e][-1]) for e in events] == [
         (pytest.approx(0.04, abs=2e-4), pytest.approx(0.10, abs=2e-4)),
@@ -158,7 +170,8 @@ def test_metrics_of_the_simulated_impact(impact):
 def test_axes_matter_for_damage_only(impact):
     _, rows = impact
     plain, j211 = (measure_impacts(rows, [(0, 0, 0.75)], 9.8,
-                                   ImpactParams(trigger=20.0, axes=a))[0] for a in ("rep103", "j211"))
+                                   ImpactParams(trigger=20.0, axes=a))[0]
+                   for a in ("rep103", "j211"))
     assert plain["damage"] != pytest.approx(j211["damage"], rel=1e-3)
     for name in ("hic15", "bric", "gambit", "peak_velocity_change"):
         assert plain[name] == pytest.approx(j211[name], rel=1e-12)

@@ -5,9 +5,12 @@ import pytest
 
 from imu_fusion.errors import EstimationError, LayoutError, ParameterError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams, Sensor,
-                                                             parse_configuration)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Sensor,
+    parse_configuration,
+)
 from imu_fusion.estimation.acceleration_field.sensor_array import make_sensor_array
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
@@ -104,7 +107,7 @@ def rows(motion, change, **parameters):
     ({"integration": "high_order"}, {"method": "ao"}),
     ({"maximum_likelihood": "motion"}, {"mode": "smoothed", "iteration.max": 1}),
     ({"iteration.max": 1}, {"mode": "smoothed"}),
-], ids=lambda v: "-".join(v))
+], ids="-".join)
 def test_a_parameter_changes_the_estimate(motion, change, with_):
     plain, changed = rows(motion, {}, **with_), rows(motion, change, **with_)
     assert plain.tobytes() != changed.tobytes()

@@ -8,18 +8,28 @@ from scipy.stats import chi2
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.maximum_likelihood import (fit_densities,
-                                                                         log_likelihood)
+from imu_fusion.estimation.acceleration_field.maximum_likelihood import (
+    fit_densities,
+    log_likelihood,
+)
 from imu_fusion.estimation.acceleration_field.motion_model import motion_step
-from imu_fusion.estimation.acceleration_field.params import (AccelerationFieldParams,
-                                                             AccelerometerParams, Initial, Motion)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+    Motion,
+)
 from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter
 from imu_fusion.estimation.acceleration_field.rigid_body_smoother import smooth_once
 from imu_fusion.estimation.acceleration_field.rows import SATURATED, field_at
 from imu_fusion.estimation.acceleration_field.start import given_start
 from imu_fusion.simulation.noise import ornstein_uhlenbeck
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
-                                                     simulate)
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_PARTICLE,
+    PAPER_POSITIONS,
+    simulate,
+)
 from imu_fusion.simulation.rigid_body_motion import draw_motion, ideal_readings
 
 RATE, SD_ALPHA = 50.0, 100.0
@@ -220,7 +230,10 @@ def test_maximum_likelihood_finds_what_made_the_motion():
         "mode": "smoothed", "motion.jerk_density": PARAMS.motion.jerk_density / 5,
         "motion.acceleration_rate_density": 1000.0, "noise_scale": 2.0,
         "maximum_likelihood": "motion_and_noise"})
-    make_start = lambda p: given_start(p, array)
+
+    def make_start(params):
+        return given_start(params, array)
+
     found = fit_densities(wrong, array, make_start, stamp, readings)
     # 600 samples of three axes give densities to about a tenth, the noise to a hundredth; rate
     # and jerk density are strongly correlated.

@@ -68,7 +68,7 @@ def test_no_jump_says_so(recording):
                                vel_world=0.2 * recording.velocity.vel_world)
     with pytest.raises(EstimationError, match="never exceeds 10 m/s"):
         detect_jump(recording.imu, slow)
-    with pytest.raises(EstimationError, match="parameters takeoff and touchdown"):
+    with pytest.raises(EstimationError, match="jump.takeoff and jump.touchdown"):
         detect_jump(recording.imu, None)
 
 

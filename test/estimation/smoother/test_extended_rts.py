@@ -278,7 +278,7 @@ def test_corrected_readings_say_how_sure_they_are(short, whole):
     assert np.allclose(samples["gyr_sd"], np.hypot(samples["gyr_bias_sd"], 0.0175), rtol=1e-6)
     assert np.allclose(samples["acc_sd"], np.hypot(samples["acc_bias_sd"], 0.1), rtol=1e-6)
     limit = np.sort(np.abs(imu.acc).max(axis=1))[-20]
-    params = PARAMS.replace(acc_range=limit)
+    params = PARAMS.replace(**{"sensor.acc_range": (limit,)})
     clipped = Smoother(params).run(
         dataclasses.replace(imu, acc=imu.acc.clip(-limit, limit)), *logs)
     lost = np.abs(imu.acc) >= 0.999 * limit
@@ -289,7 +289,8 @@ def test_corrected_readings_say_how_sure_they_are(short, whole):
 def test_given_events_and_windows_are_used(jump):
     r = record(jump, np.random.default_rng(3))
     imu = r.imu[:300]
-    params = PARAMS.replace(takeoff=1.0, touchdown=2.5, surface_windows=(0.0, 0.8, 2.7, 3.0))
+    params = PARAMS.replace(**{"jump.takeoff": 1.0, "jump.touchdown": 2.5,
+                               "surface.windows": (0.0, 0.8, 2.7, 3.0)})
     seen = []
 
     class Spy(Model):

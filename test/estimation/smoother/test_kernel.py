@@ -182,7 +182,7 @@ def test_solver_agrees_with_dense_algebra():
     tau = np.full(5, 0.005)
     values, whiten = rng.standard_normal((5, 3)), np.tril(rng.uniform(0.5, 1.5, (5, 3, 3)))
     start = np.searchsorted(sample, np.arange(count + 1))
-    measured = (start, kinds, tau, values, whiten, np.zeros(5))
+    measured = (start, kinds, tau, values, whiten, np.full(5, np.inf))
     row_sample = np.array([0, 3, 3, 6])
     rows = (np.searchsorted(row_sample, np.arange(count + 1)), rng.standard_normal(4),
             rng.standard_normal((4, 9)), np.full(4, 0.7), np.array([True, False, True, True]))
@@ -274,7 +274,7 @@ def test_segments_change_nothing():
     m = np.arange(0, count - 1, 10)
     measured = (np.searchsorted(m, np.arange(count + 1)), np.zeros(len(m), np.int64),
                 np.zeros(len(m)), rng.standard_normal((len(m), 3)),
-                np.tile(np.eye(3), (len(m), 1, 1)), np.zeros(len(m)))
+                np.tile(np.eye(3), (len(m), 1, 1)), np.full(len(m), np.inf))
     rows = (np.zeros(count + 1, np.int64), np.empty(0), np.empty((0, 3)), np.empty(0),
             np.empty(0, bool))
     moved = x.copy()

@@ -6,6 +6,7 @@ import pytest
 from benchmarks import smoother_drive, smoother_flight
 from benchmarks.data import data_path
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
 from imu_fusion.simulation.jump_sensors import EPOCH
 
@@ -38,8 +39,8 @@ def test_a_start_at_speed_finds_its_heading(drive, start, delays):
     imu, fix, velocity, _ = drive
     begin = int(imu.stamp[0] + start * 1e9)
     logs = [log.between(begin, begin + 60_000_000_000) for log in (imu, fix, velocity)]
-    changes = dict(gnss_time_offset_sd=0.2, velocity_time_offset_sd=0.2) if delays else {}
-    result = Smoother(SmootherParams(**changes)).run(logs[0], None, *logs[1:])
+    changes = {"gnss.time_offset_sd": 0.2, "gnss.velocity_time_offset_sd": 0.2} if delays else {}
+    result = Smoother(SmootherParams.from_mapping(changes)).run(logs[0], None, *logs[1:])
     assert result.converged and result.misfit()["fix"] < 1.5 and not result.remarks()
     if delays:
         assert result.states["velocity_time_offset"][0][0, 0] == pytest.approx(0.125, abs=0.01)
@@ -124,8 +125,7 @@ def test_indoor_walk_admits_what_its_position_is_worth():
                     for c in columns["Gyroscope"][:, 1:].T], axis=1)
     place = columns["Location"]
     cov = np.eye(3) * place[:, 6, None, None] ** 2
-    params = SmootherParams(gnss_position_error_sd=(22.0, 22.0, 22.0),
-                            gnss_position_error_tau=60.0)
+    params = SmootherParams(gnss=Gnss(position_error_sd=(22.0, 22.0, 22.0), position_error_tau=60.0))
     result = Smoother(params).run(
         ImuLog(stamp["Accelerometer"], gyr=gyr, acc=columns["Accelerometer"][:, 1:]),
         MagLog(stamp["Magnetometer"], columns["Magnetometer"][:, 1:] * 1e-6),

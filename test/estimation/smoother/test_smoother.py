@@ -10,6 +10,7 @@ from imu_fusion.errors import EstimationError, ParameterError, SampleError
 from imu_fusion.estimation.smoother.events import JumpEvents, detect_jump, find_jump
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.inputs import even_stamps, spaced
+from imu_fusion.estimation.smoother.params import Gnss, Iteration, Jump, Sensor
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.simulation.jump_sensors import (
@@ -46,7 +47,7 @@ def test_corrected_readings_err_as_they_say(jump):
     """Clipped ones too: rates beyond 2 rad/s (some 30 samples per axis), and the impact."""
     r = record(jump, np.random.default_rng(8), PhoneErrors(gyr_range=2.0))
     imu = dataclasses.replace(r.imu, acc=np.clip(r.imu.acc, -40.0, 40.0))
-    s = Smoother(SmootherParams(gyro_range=2.0, acc_range=40.0), jump.hill).run(
+    s = Smoother(SmootherParams(sensor=Sensor(gyro_range=(2.0,), acc_range=(40.0,))), jump.hill).run(
         imu, r.mag, r.fix, r.velocity).samples
     true = period_means(jump, (imu.stamp - EPOCH) * 1e-9, 0.01)
     for name, raw, truth, limit, noise in (("gyr", imu.gyr, true[0], 2.0, 0.0175),
@@ -128,7 +129,7 @@ def test_outliers_are_set_aside(jump):
 
 def test_delay_of_the_receiver_is_found(jump):
     late = record(jump, np.random.default_rng(6), gnss=GnssErrors(time_offset=0.1))
-    r = Smoother(SmootherParams(gnss_time_offset_sd=0.2), jump.hill).run(
+    r = Smoother(SmootherParams(gnss=Gnss(time_offset_sd=0.2)), jump.hill).run(
         late.imu, late.mag, late.fix, late.velocity)
     check(r, late, jump)
     offset, sd = (v[0, 0] for v in r.states["gnss_time_offset"])
@@ -137,7 +138,7 @@ def test_delay_of_the_receiver_is_found(jump):
 
 def test_wandering_position_error_needs_its_state(jump):
     wander = record(jump, np.random.default_rng(7), gnss=GnssErrors(position_tau=30.0))
-    params = SmootherParams(gnss_position_error_sd=(2.9, 2.9, 4.9))
+    params = SmootherParams(gnss=Gnss(position_error_sd=(2.9, 2.9, 4.9)))
     r = Smoother(params, jump.hill).run(wander.imu, wander.mag, wander.fix, wander.velocity)
     # Lateral position past the table is only as good as the wandering fixes.
     check(r, wander, jump, BOUNDS * [2, 3, 1, 1, 1.5, 1, 1, 1, 1])
@@ -147,9 +148,8 @@ def test_wandering_position_error_needs_its_state(jump):
 def test_filtered_velocities_need_their_state(jump):
     """A receiver's filter makes its velocity errors wander: as white ones they are believed too
     much."""
-    sd = tuple(np.sqrt(0.95) * np.array(SmootherParams().velocity_sd))
-    models = (SmootherParams(), SmootherParams(gnss_velocity_error_sd=sd,
-                                               gnss_velocity_error_tau=1.0))
+    sd = tuple(np.sqrt(0.95) * np.array(Gnss().velocity_sd))
+    models = (SmootherParams(), SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)))
     found = []
     for seed in range(4):
         filtered = record(jump, np.random.default_rng(seed), gnss=GnssErrors(velocity_tau=1.0))
@@ -173,7 +173,7 @@ def test_jittered_stamps_of_even_fixes_are_put_back():
     # The mean lateness stays (it is the receiver's delay); the jitter of 29 ms goes.
     assert abs(error.mean() - jitter.mean() * 1e-9) < 1e-4 and error.std() < 5e-3
     assert np.array_equal(even_stamps(true), true)
-    with pytest.raises(SampleError, match="gnss_even_stamps"):
+    with pytest.raises(SampleError, match="gnss.even_stamps"):
         even_stamps(np.sort(EPOCH + rng.integers(0, 100 * 10**9, 300)))
 
 
@@ -189,7 +189,7 @@ def test_clipped_gyroscope_is_bridged(jump):
     clipped = record(jump, np.random.default_rng(8), PhoneErrors(gyr_range=2.0))
     lost = np.abs(clipped.imu.gyr).max(axis=1) >= 1.999
     assert lost.sum() > 5
-    r = Smoother(SmootherParams(gyro_range=2.0), jump.hill).run(
+    r = Smoother(SmootherParams(sensor=Sensor(gyro_range=(2.0,))), jump.hill).run(
         clipped.imu, clipped.mag, clipped.fix, clipped.velocity)
     check(r, clipped, jump, BOUNDS * [1, 1, 1, 1, 1, 1, 3, 3, 3])
     error = r.samples["gyr"][lost] - clipped.motion.omega_imu[lost]
@@ -234,7 +234,7 @@ def test_a_delay_that_puts_every_fix_on_a_sample_converges(jump):
     # samples; this seed went to and fro between them.
     r = record(jump.shaken(np.random.default_rng([2, 1])), np.random.default_rng(2),
                gnss=GnssErrors(time_offset=0.1))
-    result = Smoother(SmootherParams(gnss_time_offset_sd=0.2), jump.hill).run(
+    result = Smoother(SmootherParams(gnss=Gnss(time_offset_sd=0.2)), jump.hill).run(
         r.imu, r.mag, r.fix, r.velocity)
     delay, sd = (v[0, 0] for v in result.states["gnss_time_offset"])
     assert result.converged and result.iterations < 15
@@ -248,7 +248,7 @@ def test_what_cannot_be_estimated_says_so(jump, recording):
         Smoother().run(imu, mag, None, velocity)
     with pytest.raises(EstimationError, match="no valid GNSS fix"):
         Smoother().run(imu, mag, dataclasses.replace(fix, status=fix.status - 1), velocity)
-    with pytest.raises(EstimationError, match="parameters takeoff and touchdown"):
+    with pytest.raises(EstimationError, match="jump.takeoff and jump.touchdown"):
         smoother.run(imu, mag, fix, None)
     with pytest.raises(SampleError, match="go backwards after"):
         smoother.run(imu[np.r_[0:50, 40:100]], mag, fix, velocity)
@@ -266,18 +266,18 @@ def test_what_cannot_be_estimated_says_so(jump, recording):
 
 def test_a_result_to_be_doubted_says_why(jump, recording, result):
     assert result.remarks() == []
-    few = Smoother(SmootherParams(max_iterations=1), jump.hill).run(
+    few = Smoother(SmootherParams(iteration=Iteration(max=1)), jump.hill).run(
         recording.imu, recording.mag, recording.fix, recording.velocity)
     assert any("did not converge" in text for text in few.remarks())
     # Fixes of 3 m and 5 m that claim to be ten times better, without the loss that hides it.
     fix = dataclasses.replace(recording.fix, cov_enu=np.broadcast_to(
         np.diag([0.09, 0.09, 0.25]), (len(recording.fix), 3, 3)))
-    claimed = Smoother(SmootherParams(fix_loss_scale=0.0)).run(
+    claimed = Smoother(SmootherParams(gnss=Gnss(loss="squared"))).run(
         recording.imu, recording.mag, fix, recording.velocity)
     assert claimed.misfit()["fix"] > 5.0
-    assert any("fix innovations" in text and "fix_sd" in text for text in claimed.remarks())
+    assert any("fix innovations" in text and "gnss.fix_sd" in text for text in claimed.remarks())
     # As the remark advises: what the messages claim is not taken.
-    own = Smoother(SmootherParams(fix_loss_scale=0.0, gnss_covariances=False)).run(
+    own = Smoother(SmootherParams(gnss=Gnss(loss="squared", covariances=False))).run(
         recording.imu, recording.mag, fix, recording.velocity)
     assert abs(own.misfit()["fix"] - 1.0) < 0.2 and own.remarks() == []
 
@@ -290,7 +290,7 @@ def test_given_events_are_used_without_velocities(jump, recording):
 
 
 def test_events_given_as_parameters_stand_for_detected_ones(jump, recording, result):
-    given = SmootherParams(takeoff=jump.t_takeoff + 0.1, touchdown=jump.t_touchdown - 0.1)
+    given = SmootherParams(jump=Jump(jump.t_takeoff + 0.1, jump.t_touchdown - 0.1))
     r = Smoother(given, jump.hill).run(recording.imu, recording.mag, recording.fix,
                                        recording.velocity)
     check(r, recording, jump)
@@ -308,4 +308,4 @@ def test_events_given_as_parameters_stand_for_detected_ones(jump, recording, res
     with pytest.raises(EstimationError, match="before the take-off that was given"):
         find_jump(recording.imu, recording.velocity, takeoff=jump.t_touchdown + 1.0)
     with pytest.raises(ParameterError, match="not after the take-off"):
-        SmootherParams(takeoff=5.0, touchdown=4.0)
+        SmootherParams(jump=Jump(takeoff=5.0, touchdown=4.0))

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.estimation.smoother.surface_fit import at_surface
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, record
@@ -33,8 +34,8 @@ def check_normalised(z):
     assert low < np.mean(z ** 2) < high, z
 
 
-def run(jump, logs, **params):
-    result = Smoother(SmootherParams(**params), jump.hill).run(*logs)
+def run(jump, logs, params):
+    result = Smoother(SmootherParams.from_mapping(params), jump.hill).run(*logs)
     assert result.converged
     return result
 
@@ -60,8 +61,9 @@ def test_errors_of_sensors_and_antenna_are_found(jump):
             ("latitude_deg", "longitude_deg", "height"), geodetic)))
         velocity = dataclasses.replace(r.velocity, vel_world=r.velocity.vel_world
                                        + turn.apply(np.cross(motion.omega_imu, lever)))
-        states = run(jump, (imu, r.mag, fix, velocity), acc_matrix_sd=0.03, gyro_scale_sd=0.03,
-                     gnss_lever_arm_sd=0.5).states
+        states = run(jump, (imu, r.mag, fix, velocity), {
+            "sensor.acc_matrix_sd": 0.03, "sensor.gyro_scale_sd": 0.03,
+            "gnss.lever_arm_sd": 0.5}).states
         for name, true in zip(prior, (matrix, scale, lever)):
             errors[name].append(states[name][0][0] - true)
             sds[name].append(states[name][1][0])
@@ -109,7 +111,7 @@ def test_the_point_at_the_lever_arm_is_held(jump):
     r = record(Carried(jump, LEVER), np.random.default_rng(3))
 
     def judged(lever):
-        result = run(jump, (r.imu, r.mag, r.fix, r.velocity), surface_lever_arm=tuple(lever))
+        result = run(jump, (r.imu, r.mag, r.fix, r.velocity), {"surface.lever_arm": tuple(lever)})
         error = result.samples["position_world"] - r.motion.position_world
         return (result, np.sqrt(np.mean(error ** 2, axis=0)),
                 nees(error, result.samples["cov_position"]).mean())
@@ -132,7 +134,7 @@ def test_the_lever_arm_is_found(jump):
     for seed in range(4):
         rng = np.random.default_rng([seed, 3])
         r = record(Carried(jump.shaken(rng), LEVER), rng, gnss=SHARP)
-        result = run(jump, (r.imu, r.mag, r.fix, r.velocity), surface_lever_arm_sd=1.0)
+        result = run(jump, (r.imu, r.mag, r.fix, r.velocity), {"surface.lever_arm_sd": 1.0})
         value, sd = (v[0] for v in result.states["surface_lever_arm"])
         assert np.all(sd < 0.02)
         assert abs(result.jump.length - jump.length) < 0.2
@@ -148,7 +150,7 @@ def test_samples_at_the_surface(jump):
     samples["quat_world_imu"], samples["gyr"] = carried.quat_world_imu, carried.omega_imu
     samples["cov_position"], samples["cov_attitude"] = 0.04 * np.eye(3), 0.01 * np.eye(3)
     samples["gyr_sd"] = 0.2
-    params = SmootherParams(surface_lever_arm=tuple(LEVER))
+    params = SmootherParams(surface=SurfaceContact(lever_arm=tuple(LEVER)))
     given = at_surface(samples, {}, params)
     assert np.allclose(given["position_world"], skis.position_world, rtol=0, atol=1e-9)
     assert np.allclose(given["vel_world"], skis.vel_world, rtol=0, atol=1e-9)

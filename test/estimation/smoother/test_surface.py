@@ -10,6 +10,7 @@ from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.smoother.events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.params import Gnss, SurfaceContact
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import LocalFrame
@@ -26,10 +27,16 @@ def test_unknown_height_of_the_sensor(jump):
     # With the GNSS of a survey the height shows; with a logger's it stays uncertain.
     sharp = GnssErrors(position_sd=(0.05, 0.05, 0.1))
     rec = record(jump, np.random.default_rng(9), gnss=sharp)
-    r = Smoother(SmootherParams(body_height_sd=2.0), believed).run(
+    r = Smoother(SmootherParams(surface=SurfaceContact(body_height_sd=2.0)), believed).run(
         rec.imu, rec.mag, rec.fix, rec.velocity)
     height, sd = (v[0, 0] for v in r.states["body_height"])
     assert abs(height - 1.0) < max(4 * sd, 0.05) and sd < 0.1
+    # Given, it counts as well as found.
+    given = Smoother(SmootherParams(surface=SurfaceContact(body_height=1.0)), believed).run(
+        rec.imu, rec.mag, rec.fix, rec.velocity)
+    up = [np.median((low.to_geodetic(s.samples["position_world"])[2] - jump.hill.origin.to_geodetic(
+        rec.motion.position_world)[2])) for s in (given, r)]
+    assert np.abs(up).max() < 0.05 and given.remarks() == []
 
 
 def test_a_surface_that_does_not_fit_says_so(jump, recording, result):
@@ -50,7 +57,7 @@ def test_a_surface_that_does_not_fit_says_so(jump, recording, result):
     north = float(text.split("by ")[1].split("/")[1])
     assert -5.0 / 3.0 < north < -0.5
     # Fixes that may wander by that much do not lie beside.
-    wander = SmootherParams(gnss_position_error_sd=(5.0, 5.0, 5.0), gnss_position_error_tau=300.0)
+    wander = SmootherParams(gnss=Gnss(position_error_sd=(5.0, 5.0, 5.0), position_error_tau=300.0))
     assert Smoother(wander, shifted).run(*logs).remarks() == []
 
 
@@ -67,7 +74,7 @@ def test_a_surface_says_as_much_per_second_at_any_rate(jump):
         if rate == 100:
             assert np.allclose(sigma, 0.1, rtol=1e-12)  # as the paper has it
     # A simulated sensor moves against the skis with the density of these rows.
-    allowed = 0.1 * np.sqrt(2.0 * SmootherParams().surface_interval * FASTEST_WOBBLE)
+    allowed = 0.1 * np.sqrt(2.0 * SurfaceContact().interval * FASTEST_WOBBLE)
     assert abs(jump.params.wobble / allowed - 1) < 0.02
     # Two rows for 10 s of independent 0.1 m every 0.01 s, and half an interval at the ends.
     assert np.allclose(said, 2 * 10 / 0.01 / 0.1 ** 2, rtol=0.003)
@@ -88,9 +95,10 @@ def test_deviations_over_seconds_are_told_by_what_sigma_allows(rate):
     assert abs(fit.excess - 1.5) < 0.02
     assert abs(fit.rms - 0.025) < 1e-9 and abs(fit.largest - 0.035) < 1e-9
     lifted = surface_fits(plane.constraints(), samples, {}, None,
-                          SmootherParams(body_height=0.015))["plane"]
+                          SmootherParams(surface=SurfaceContact(body_height=0.015)))["plane"]
     assert lifted.excess < 0.05  # samples beside the gap count up to fivefold
-    slow = SmootherParams(surface_interval=0.04)  # twice as far for twice the deviation
+    # Twice as far for twice the deviation.
+    slow = SmootherParams(surface=SurfaceContact(interval=0.04))
     assert abs(surface_fits(plane.constraints(), samples, {}, None, slow)["plane"].excess
                - 0.75) < 0.02
 
@@ -115,7 +123,7 @@ def test_a_surface_holds_within_its_windows(jump, recording):
         "type": "plane", "slope_deg": 0.0, "aspect_deg": 0.0, "sigma": 0.01,
         "origin": {"latitude": origin.latitude_deg, "longitude": origin.longitude_deg,
                    "height": origin.height + float(recording.motion.position_world[0, 2])}})
-    windows = SmootherParams(surface_windows=(1.0, 4.0, 4.5, 5.0))
+    windows = SmootherParams(surface=SurfaceContact(windows=(1.0, 4.0, 4.5, 5.0)))
     r = Smoother(windows, level).run(recording.imu, recording.mag, recording.fix,
                                      recording.velocity)
     (fit,) = r.surface.values()
@@ -130,12 +138,12 @@ def test_a_surface_holds_within_its_windows(jump, recording):
     whole = Smoother(SmootherParams(), level).run(recording.imu, recording.mag, recording.fix,
                                                   recording.velocity)
     assert any("stands off the surface" in text for text in whole.remarks())
-    with pytest.raises(EstimationError, match="says nothing at any sample.*surface_windows"):
-        Smoother(SmootherParams(surface_windows=(50.0, 60.0)), level).run(
+    with pytest.raises(EstimationError, match="says nothing at any sample.*surface.windows"):
+        Smoother(SmootherParams(surface=SurfaceContact(windows=(50.0, 60.0))), level).run(
             recording.imu, recording.mag, recording.fix, recording.velocity)
     for wrong in ((1.0,), (4.0, 1.0), (1.0, 3.0, 2.0, 4.0)):
         with pytest.raises(ParameterError, match="pairs of start and stop"):
-            SmootherParams(surface_windows=wrong)
+            SmootherParams(surface=SurfaceContact(windows=wrong))
 
 
 def test_a_grid_that_ends_says_so(jump, recording):

@@ -1,50 +1,52 @@
-"""``imu_fusion demo``: the main jobs on recordings, through real ROS 2 nodes."""
+"""The demo of the orientation: a sensor turned by hand, against an optical reference."""
 
 import time
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
-from imu_fusion.demos import trajectory
-from imu_fusion.demos.impact import impact
-from imu_fusion.demos.trajectory import shared
-from imu_fusion.errors import ParameterError
-from imu_fusion.evaluation.orientation_error import (moving_at, orientation_errors, shares_within,
-                                                     statistics)
-from imu_fusion.nodes.processes import Graph
-from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.demos.data import data_folder
+from imu_fusion.evaluation.orientation_error import (
+    moving_at,
+    orientation_errors,
+    shares_within,
+    statistics,
+)
 from imu_fusion.messages.convert import attitude_log, bool_value
+from imu_fusion.nodes.processes import NodeProcesses
+from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.recording import write_recording_report
 
 
-def orientation(out, console):
+def show(out: Path, console: Console) -> None:
     """Play a BROAD trial through replayer, orientation_estimator and recorder."""
-    bag = shared("bags") / "broad_06_fast_rotation"
+    bag = data_folder("bags") / "broad_06_fast_rotation"
     recording = out / "recording"
     started = time.monotonic()
-    with Graph(out / "logs") as graph:
-        graph.start("recorder", out=str(recording), overwrite=True)
-        graph.start("orientation_estimator", qos="reliable")
-        graph.start("replayer", show=True, bag=str(bag), rate=0.0,
+    with NodeProcesses(out / "logs") as nodes:
+        nodes.start("recorder", out=str(recording), overwrite=True)
+        nodes.start("orientation_estimator", qos="reliable")
+        nodes.start("replayer", show=True, bag=str(bag), rate=0.0,
                     wait_for_nodes=("recorder", "orientation_estimator"))
-        graph.wait("replayer", 300)
-        graph.finish("recorder", 30.0)
+        nodes.wait("replayer", 300)
+        nodes.finish("recorder", 30.0)
     elapsed = time.monotonic() - started
 
     with open_bag(bag) as played, open_bag(recording) as recorded:
         duration = (played.end_time - played.start_time) * 1e-9
         console.print(_message_table(played, recorded))
-        errors, moving = compare(played, recorded)
+        errors, moving = _compare(played, recorded)
     console.print(_error_table(errors, moving))
     report = out / "report.html"
     write_recording_report(bag, recording, report)
     console.print(f"{duration:.0f} s of data in {elapsed:.0f} s through three ROS 2 processes "
-                  f"(domain {graph.domain})\nrecording: {recording}\nreport:    {report}")
+                  f"(domain {nodes.domain})\nrecording: {recording}\nreport:    {report}")
 
 
-def compare(played, recorded):
+def _compare(played, recorded):
     """Errors of the recorded imu/data against the reference of what was played.
 
     Returns:
@@ -82,26 +84,3 @@ def _error_table(errors, moving):
     for name, (_, _, three) in shares_within(errors, moving).items():
         table.add_row(f"{name} within 3 sigma", f"{100 * three:.1f} %", "", "", "")
     return table
-
-
-DEMOS = {"orientation": orientation, "impact": impact, "drive": trajectory.drive,
-         "jump": trajectory.jump}
-
-
-def run(name, out, console):
-    """Run a demo.
-
-    Args:
-        name: one of DEMOS.
-        out: directory for its files.
-        console: rich Console.
-
-    Raises:
-        ParameterError: no such demo.
-        ImuFusionError: a node failed.
-    """
-    if name not in DEMOS:
-        raise ParameterError(f"no demo '{name}'; there are: {', '.join(DEMOS)}")
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    DEMOS[name](out, console)
