@@ -16,6 +16,7 @@ from imu_fusion.estimation.acceleration_field.motion_model import (
     THETA,
 )
 from imu_fusion.geometry.rotation import quat_to_matrix, skew
+from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.kernels import njit
 
 # Bits of ``flags``.
@@ -122,12 +123,3 @@ def field_at(rows: np.ndarray, points: ArrayLike, gravity: float) -> tuple[
     force = rows["specific_force"][:, None, :] + change
     body = force - gravity * rotation[:, None, 2, :]
     return force, body, np.einsum("nij,npj->npi", rotation, body)
-
-
-@njit
-def rotation_matrices(quat):
-    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4)."""
-    out = np.empty((len(quat), 3, 3))
-    for i in range(len(quat)):
-        out[i] = quat_to_matrix(quat[i])
-    return out
