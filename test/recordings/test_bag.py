@@ -246,7 +246,7 @@ def test_writer_refuses_what_is_in_its_way(tmp_path):
 def test_the_file_itself_carries_rosbag2_s_metadata(tmp_path):
     """As rosbag2_storage_mcap writes it: what metadata.yaml says, below its first key."""
     with BagWriter(tmp_path / "bag") as writer:
-        writer.write("/imu", IMU.msgtype, imu(START), START)
+        writer.write("/imu", IMU.msgtype, imu(0), START)
     said = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())
     with open(tmp_path / "bag" / "bag_0.mcap", "rb") as stream:
         (entry,) = make_reader(stream).iter_metadata()
