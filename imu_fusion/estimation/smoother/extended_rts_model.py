@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_fusion.estimation.smoother.model import FIX, VELOCITY
+from imu_fusion.estimation.smoother.measurements.registry import FIX, VELOCITY
 from imu_fusion.geometry.rotation import skew
 
 #: Where a state x (22,) has position, velocity, quaternion and the errors of gyroscope,

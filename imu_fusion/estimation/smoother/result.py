@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.geometry.geodesy import LocalFrame
 
 SAMPLE = np.dtype([
@@ -22,14 +23,7 @@ _EXCESS = 1.5                # of the deviation from a surface; see smoother_sur
 _SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
-_CAUSES = {
-    "fix": "the covariances of the messages (gnss.covariances: false) or gnss.fix_sd may be too small, "
-           "the stamps late (gnss.time_offset_sd: 0.2 finds it) or the errors wander "
-           "(gnss.position_error_sd)",
-    "velocity": "the covariances of the messages (gnss.covariances: false) or gnss.velocity_sd may be "
-                "too small, the stamps late (gnss.velocity_time_offset_sd: 0.2 finds it) or filtered "
-                "(gnss.velocity_error_sd, gnss.min_interval)",
-    "mag": "the field may be disturbed, or sensor.mag_noise_sd, mag_bias_sd and mag_scale_sd too small"}
+_ADVICE = {m.name: m.advice for m in MEASUREMENTS}
 
 
 def reading_variances(stamp, params):
@@ -122,7 +116,7 @@ class SmootherResult:
         for name, size in self.misfit().items():
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
-                             f"standard deviations: {_CAUSES.get(name, _CAUSES['fix'])}")
+                             f"standard deviations: {_ADVICE[name]}")
         beside = self._beside()
         if beside is not None:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "
