@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 # Docstrings: imperative mood, Google sections without underlines, first sentences of two lines.
 PEP257 := --add-ignore D205 D209 D213 D400 D401 D403 D406 D407 D413 D415 D417
 
-.PHONY: demo test test-slow test-all lint bench clean kernels
+.PHONY: demo test test-slow test-all lint bench docs clean kernels
 
 $(READY): setup.py setup.cfg package.xml
 	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), "imu_fusion needs Python 3.11 to 3.13 (the Jazzy wheels), this is " + sys.version.split()[0] + "; try make PYTHON=python3.12"'
@@ -45,5 +45,8 @@ lint: $(READY)
 bench: $(READY)
 	$(BIN)/python -m benchmarks
 
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo_out build install log
+	rm -rf $(VENV) demo_out site build install log

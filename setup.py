@@ -18,8 +18,9 @@ report = ["plotly>=5.15"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
-test = ["ruff>=0.6", "mypy>=1.10", "types-PyYAML", "pytest>=7.4", "pytest-xdist>=3.5", "hypothesis>=6", "colcon-common-extensions", *report,
-        *terrain]
+docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
+test = ["ruff>=0.6", "mypy>=1.10", "types-PyYAML", "pytest>=7.4", "pytest-xdist>=3.5",
+        "hypothesis>=6", "colcon-common-extensions", *report, *terrain, *docs]
 
 # Read, not imported: nothing of the package is installed yet.
 nodes = run_path(f"{package_name}/nodes/__init__.py")["NODES"]
@@ -52,7 +53,7 @@ setup(
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
     extras_require={"ros": ros, "report": report, "terrain": terrain, "peers": peers,
-                    "oracles": oracles, "test": test},
+                    "oracles": oracles, "docs": docs, "test": test},
     entry_points={"console_scripts": [
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],

@@ -3,71 +3,55 @@
     ros2 launch imu_fusion pipeline.launch.py bag:=PATH [out:=DIRECTORY] [rate:=0.0]
         [params_file:=FILE] [report:=true]
 
-Ends by itself when everything has been played, smoothed and recorded. `imu_fusion pipeline`
-does the same without launch.
+Compiles first, where that has not been done. Ends by itself when everything has been played,
+smoothed and recorded, or with a failure when a node fails. `imu_fusion pipeline` does the same
+without launch.
 """
 
 import sys
 
-from launch import LaunchDescription
-from launch.actions import (DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction,
-                            RegisterEventHandler)
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-
-def shutdown_after(action, reason):
-    """End everything when ``action`` has ended."""
-    return RegisterEventHandler(OnProcessExit(
-        target_action=action, on_exit=[EmitEvent(event=Shutdown(reason=reason))]))
-
-
-def shutdown_if_failed(action):
-    """End everything when ``action`` ends with another exit code than 0."""
-    return RegisterEventHandler(OnProcessExit(
-        target_action=action, on_exit=lambda event, context: EmitEvent(
-            event=Shutdown(reason=f"{event.process_name} failed")) if event.returncode else None))
+from imu_fusion.nodes.launching import after_compiling, check_arguments, on_success, shutdown
+from imu_fusion.nodes.pipeline import plan_pipeline
+from launch import LaunchDescription
 
 
 def start(context):
-    """The nodes for the arguments given: the acceleration field's where it is configured."""
-    from imu_fusion.streams.acceleration_field import read_configuration
-
-    given = {name: LaunchConfiguration(name).perform(context)
-             for name in ("bag", "out", "rate", "params_file", "report")}
-    estimators = ["smoother", "orientation_estimator"]
-    if read_configuration(given["params_file"]).accelerometers:
-        estimators.append("acceleration_field_estimator")
+    """The nodes that have work to do with the recording; refused before any of them starts."""
+    given = check_arguments({name: LaunchConfiguration(name).perform(context)
+                             for name in ("bag", "out", "rate", "params_file", "report")})
+    plan = plan_pipeline(given.bag, given.params_file)
 
     def node(name, **parameters):
         return Node(package="imu_fusion", executable=name, name=name, output="screen",
-                    parameters=[given["params_file"], parameters])
+                    parameters=[given.params_file, parameters])
 
-    recorder = node("recorder", out=given["out"], end_with_sources=True,
+    recorder = node("recorder", out=given.out, end_with_sources=True,
                     expected_sources=["smoother"])
-    trigger = node("smoothing_trigger")
-    replayer = node("replayer", bag=given["bag"], rate=float(given["rate"]),
-                    wait_for_subscribers=0, wait_for_nodes=["recorder", "smoothing_trigger", *estimators])
-    nodes = [recorder, trigger, replayer, *(node(name, qos="reliable") for name in estimators)]
-    ends = [shutdown_if_failed(replayer), shutdown_if_failed(trigger)]
+    # ROS has no empty lists: what is empty is left to its default.
+    replay = {name: list(value) if isinstance(value, tuple) else value
+              for name, value in plan.replay_parameters(given.bag).items() if value != ()}
+    others = [node("smoothing_trigger"), node("replayer", **replay | {"rate": given.rate}),
+              *(node(name, qos="reliable") for name in plan.estimators)]
     # The recorder ends by itself when replay and smoother have said that nothing more comes.
-    if given["report"].lower() == "true":
+    recorded = [shutdown("recording ended")]
+    handlers = []
+    if given.report:
         report = ExecuteProcess(output="screen", cmd=[
-            sys.executable, "-m", "imu_fusion.cli", "report", given["bag"],
-            "--estimates", given["out"], "--params-file", given["params_file"],
-            "--out", f"{given['out']}/report.html"])
-        ends += [RegisterEventHandler(OnProcessExit(target_action=recorder, on_exit=[report])),
-                 shutdown_after(report, "report written")]
-    else:
-        ends.append(shutdown_after(recorder, "recording ended"))
-    return [*nodes, *ends]
+            sys.executable, "-m", "imu_fusion.cli", "report", given.bag, "--estimates", given.out,
+            "--params-file", given.params_file, "--out", f"{given.out}/report.html"])
+        handlers.append(on_success(report, [shutdown("report written")]))
+        recorded = [report]
+    handlers += [on_success(recorder, recorded), *map(on_success, others)]
+    return after_compiling([*handlers, recorder, *others])
 
 
 def generate_launch_description():
-    """The arguments, the nodes, and what ends them."""
+    """The arguments, and what starts the rest."""
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="recording to replay"),
         DeclareLaunchArgument("out", default_value="smoothed",

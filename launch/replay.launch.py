@@ -3,22 +3,39 @@
     ros2 launch imu_fusion replay.launch.py bag:=PATH [out:=DIRECTORY] [rate:=0.0]
         [params_file:=FILE]
 
-Ends by itself when everything has been played and recorded.
+Compiles first, where that has not been done. Ends by itself when everything has been played and
+recorded, or with a failure when a node fails.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+from imu_fusion.nodes.launching import after_compiling, check_arguments, on_success, shutdown
+from launch import LaunchDescription
+
+
+def start(context):
+    """The three nodes, and what ends them; bad arguments are refused before any of them starts."""
+    given = check_arguments({name: LaunchConfiguration(name).perform(context)
+                             for name in ("bag", "out", "rate", "params_file")})
+
+    def node(name, **parameters):
+        return Node(package="imu_fusion", executable=name, name=name, output="screen",
+                    parameters=[given.params_file, parameters])
+
+    recorder = node("recorder", out=given.out)
+    others = [node("orientation_estimator"),
+              node("replayer", bag=given.bag, rate=given.rate)]
+    # The recorder ends by itself when replayer and estimator have said that nothing more comes.
+    handlers = [on_success(recorder, [shutdown("recording ended")]), *map(on_success, others)]
+    return after_compiling([*handlers, recorder, *others])
 
 
 def generate_launch_description():
-    """The arguments, the three nodes, and what ends them."""
-    arguments = [
+    """The arguments, and what starts the rest."""
+    return LaunchDescription([
         DeclareLaunchArgument("bag", description="recording to replay"),
         DeclareLaunchArgument("out", default_value="replayed",
                               description="directory of the new recording"),
@@ -28,25 +45,4 @@ def generate_launch_description():
             "params_file", description="ROS 2 parameter file",
             default_value=PathJoinSubstitution(
                 [FindPackageShare("imu_fusion"), "config", "replay.yaml"])),
-    ]
-    params_file = LaunchConfiguration("params_file")
-    recorder = Node(
-        package="imu_fusion", executable="recorder", name="recorder", output="screen",
-        parameters=[params_file, {
-            "out": ParameterValue(LaunchConfiguration("out"), value_type=str)}])
-    estimator = Node(
-        package="imu_fusion", executable="orientation_estimator", name="orientation_estimator",
-        output="screen", parameters=[params_file])
-    replayer = Node(
-        package="imu_fusion", executable="replayer", name="replayer", output="screen",
-        parameters=[params_file, {
-            "bag": ParameterValue(LaunchConfiguration("bag"), value_type=str),
-            "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}])
-
-    # The recorder ends by itself when replayer and estimator have said that nothing more comes.
-    complete = RegisterEventHandler(OnProcessExit(
-        target_action=recorder, on_exit=[EmitEvent(event=Shutdown(reason="recording ended"))]))
-    failed = RegisterEventHandler(OnProcessExit(
-        target_action=replayer, on_exit=lambda event, context: EmitEvent(
-            event=Shutdown(reason="replayer failed")) if event.returncode else None))
-    return LaunchDescription([*arguments, recorder, estimator, replayer, complete, failed])
+        OpaqueFunction(function=start)])

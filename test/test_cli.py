@@ -7,10 +7,10 @@ from click.testing import CliRunner
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imu_fusion import cli
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.messages.layouts import IMU, MAG
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 
 START = 1_700_000_000_000_000_000
 STEP = 10_000_000

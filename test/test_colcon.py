@@ -1,7 +1,6 @@
 """The package as colcon builds it, and what it installs."""
 
 import ast
-import importlib
 import os
 import shutil
 import subprocess
@@ -13,7 +12,7 @@ import pytest
 import yaml
 
 from imu_fusion.nodes import NODES
-from imu_fusion.nodes.base import Node
+from test.test_registry import node_class
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 COLCON = Path(sys.executable).parent / "colcon"
@@ -36,7 +35,7 @@ def installed(tmp_path_factory):
     shutil.copytree(REPOSITORY, workspace / "src" / "imu_fusion", ignore=shutil.ignore_patterns(
         ".*", "__pycache__", "build", "install", "log", "demo_out", "*.egg-info", "docs"))
     done = subprocess.run([COLCON, "build"], cwd=workspace, capture_output=True, text=True,
-                          timeout=300)
+                          timeout=300, check=False)
     assert done.returncode == 0 and "1 package finished" in done.stdout, done.stdout + done.stderr
     return workspace / "install" / "imu_fusion"
 
@@ -46,7 +45,7 @@ def run(installed, command):
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     return subprocess.run(
         ["bash", "-c", f". '{installed.parent / 'local_setup.bash'}' && {command}"],
-        capture_output=True, text=True, timeout=120, env=environment, cwd=installed)
+        capture_output=True, text=True, timeout=120, check=False, env=environment, cwd=installed)
 
 
 def test_every_node_starts_from_the_install_directory(installed):
@@ -83,7 +82,7 @@ def test_files_that_the_code_reads_are_installed(installed):
     package = next(installed.glob("lib/python*/site-packages/imu_fusion"))
     source = REPOSITORY / "imu_fusion"
     for path in source.glob("**/*"):
-        if path.is_file() and path.suffix not in (".pyc", ".nbi", ".nbc"):
+        if path.is_file() and "__pycache__" not in path.parts:
             assert (package / path.relative_to(source)).is_file(), path
 
 
@@ -121,9 +120,7 @@ def test_launch_files_compile_and_name_our_executables(path):
 def test_parameters_of_the_launch_file_are_those_of_the_nodes(file):
     path = REPOSITORY / f"config/{file}.yaml"
     for name, content in yaml.safe_load(path.read_text()).items():
-        module = importlib.import_module(f"imu_fusion.nodes.{name}")
-        cls, = {c for c in vars(module).values()
-                if isinstance(c, type) and issubclass(c, Node) and c.NAME == name}
-        known = {info.name: info for parameters in cls.PARAMETERS for info in parameters.infos()}
+        known = {info.name: info for parameters in node_class(name).PARAMETERS
+                 for info in parameters.infos()}
         for key, value in content["ros__parameters"].items():
             known[key].check(value)

@@ -43,7 +43,7 @@ def help_of(command):
 @pytest.mark.parametrize("name", NODES)
 def test_an_executable_is_a_node_of_that_name_which_says_what_it_does(name):
     cls = node_class(name)
-    assert cls.NAME == name and callable(importlib.import_module(cls.__module__).main)
+    assert name == cls.NAME and callable(importlib.import_module(cls.__module__).main)
     assert cls.__doc__.splitlines()[0] == NODES[name].summary
     assert f"{name} {NODES[name].summary}" in help_of("run")
 
@@ -59,8 +59,9 @@ def test_setup_installs_these_executables_and_this_version(monkeypatch):
     monkeypatch.setattr(setuptools, "setup", lambda **values: given.update(values))
     monkeypatch.chdir(ROOT)
     runpy.run_path("setup.py")
-    assert given["entry_points"]["console_scripts"] == ["imu_fusion = imu_fusion.cli:main"] + [
-        f"{name} = imu_fusion.nodes.{name}:main" for name in NODES]
+    assert given["entry_points"]["console_scripts"] == [
+        "imu_fusion = imu_fusion.cli:main",
+        *(f"{name} = imu_fusion.nodes.{name}:main" for name in NODES)]
     root = xml.etree.ElementTree.parse(ROOT / "package.xml").getroot()
     assert given["version"] == imu_fusion.__version__ == root.findtext("version")
 

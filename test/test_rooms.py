@@ -59,9 +59,9 @@ ARROWS_OF_FILES = {
 PURE = ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
         "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
         "evaluation")
-COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "enum",
-             "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib", "types",
-             "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}
+COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime",
+             "enum", "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib",
+             "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}
 COMPUTING_OF_FILES = {
     "parameters/file.py": {"pathlib", "yaml"},
     "surfaces/file.py": {"pathlib", "sys", "yaml"},

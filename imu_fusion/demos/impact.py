@@ -10,9 +10,9 @@ from rich.table import Table
 from imu_fusion.batch import process
 from imu_fusion.demos.data import data_folder
 from imu_fusion.nodes.processes import NodeProcesses
+from imu_fusion.parameters.file import load
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.parameters.file import load
 from imu_fusion.report.recording import write_recording_report
 
 # rad/s; from about here on some of the eight gyroscopes of the board clip themselves.

@@ -16,7 +16,8 @@ from imu_fusion.recordings.logs import read_log
 
 def show(out: Path, console: Console) -> None:
     """A simulated ski jump, reconstructed and compared with its truth."""
-    bag, params_file = data_folder("bags") / "jump_simulated", data_folder("config") / "jump_simulated.yaml"
+    bag = data_folder("bags") / "jump_simulated"
+    params_file = data_folder("config") / "jump_simulated.yaml"
     smoothed = replay_and_smooth(bag, out, params_file, console)
     with open_bag(bag) as reader:
         ((_, _, _, cdr),) = reader.messages(["/reference/jump"])

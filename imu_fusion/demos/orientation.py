@@ -8,11 +8,15 @@ from rich.console import Console
 from rich.table import Table
 
 from imu_fusion.demos.data import data_folder
-from imu_fusion.evaluation.orientation_error import (moving_at, orientation_errors, shares_within,
-                                                     statistics)
+from imu_fusion.evaluation.orientation_error import (
+    moving_at,
+    orientation_errors,
+    shares_within,
+    statistics,
+)
+from imu_fusion.messages.convert import attitude_log, bool_value
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.messages.convert import attitude_log, bool_value
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.recording import write_recording_report
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import yaml
 
+from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.kernels import NOTICE
 
@@ -45,6 +46,9 @@ def _is_free(port):
 class NodeProcesses:
     """Processes of our nodes; leaving the context ends those that still run.
 
+    Entering it compiles the kernels where that has not been done: nodes that compile would keep
+    the others waiting, each for itself.
+
     Args:
         logs: directory for what the nodes print, one file per node; a temporary
             one if None.
@@ -59,6 +63,7 @@ class NodeProcesses:
         self._announced = False
 
     def __enter__(self) -> "NodeProcesses":
+        compile_ahead(_say)
         return self
 
     def __exit__(self, *_):

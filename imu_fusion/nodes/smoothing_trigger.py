@@ -2,16 +2,17 @@
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from std_srvs.srv import Trigger
 
 from imu_fusion.errors import EstimationError, TopicError
-from imu_fusion.streams.smoother import INPUTS, REQUIRED
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import BEGIN, NEXT, FlowSink
 from imu_fusion.nodes.flow.protocol import STATUS_TOPIC, full_name
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.streams.smoother import INPUTS, REQUIRED
 
 
 @dataclass(frozen=True)
@@ -43,14 +44,15 @@ class SmoothingTrigger(Node):
         for topic, kind in INPUTS.items():
             self._sink.subscribe(message_class(kind.layout.msgtype), topic, lambda cdr, info: None)
 
-    def work(self):
+    def work(self) -> float:
         """See :meth:`Node.work`."""
         if self._source is None:
             return IDLE
         if self._client.service_is_ready():
             self._seen_at = time.monotonic()
         elif time.monotonic() - self._seen_at > self.params(SmoothingTriggerParams).wait_timeout:
-            raise TopicError(f"service {self._client.srv_name} is not there: does the smoother run?")
+            raise TopicError(f"service {self._client.srv_name} is not there: does the smoother "
+                             "run?")
         elif self._sent is not None:
             raise EstimationError(f"service {self._client.srv_name} has vanished without an answer")
         if self._sent is None:
@@ -83,6 +85,6 @@ class SmoothingTrigger(Node):
             self._seen_at = time.monotonic()
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(SmoothingTrigger, args)

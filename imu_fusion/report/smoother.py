@@ -5,17 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother.measurements.gnss_fix import valid_fixes
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.state import BLOCKS
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Section, Table, Text
 from imu_fusion.report.orientation import angle_panels
 from imu_fusion.report.overview import number
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
-from imu_fusion.samples import AttitudeLog, seconds
+from imu_fusion.samples import AttitudeLog, FixLog, VelocityLog, seconds
+from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
 _ENU, _XYZ = ("east", "north", "up"), ("x", "y", "z")
@@ -29,11 +32,11 @@ class Smoothed:
     """A SmootherResult with what it was made from: ``params``, ``surface`` or None, FixLog and
     VelocityLog (or None) and ``origin``, int ns, the zero of the time axes."""
 
-    result: object
-    params: object
-    surface: object
-    fix: object
-    velocity: object
+    result: SmootherResult
+    params: SmootherParams
+    surface: Surface | None
+    fix: FixLog
+    velocity: VelocityLog | None
     origin: int
 
     @property
@@ -155,8 +158,8 @@ def _flight(smoothed):
     events = smoothed.result.events
     if events is None:
         return ()
-    span = tuple(float(seconds(s, smoothed.origin)) for s in (events.takeoff, events.touchdown))
-    return (Shade("in the air", (span,)),)
+    start, stop = seconds(np.array([events.takeoff, events.touchdown]), smoothed.origin).tolist()
+    return (Shade("in the air", ((start, stop),)),)
 
 
 def _figure(smoothed, panels, caption="", **options):
@@ -267,7 +270,7 @@ def _errors(smoothed):
 
 
 def _components(time, values, sd, what, unit, names):
-    items = []
+    items: list[Band | Line] = []
     for i, (part, color) in enumerate(zip(names, fig.SERIES if len(names) > 3 else
                                           fig.AXES.values())):
         items.append(Band(f"±3σ {part}", time, values[:, i] - 3 * sd[:, i],

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
-from imu_fusion.estimation.orientation.state import FLAG_STILL
+from imu_fusion.estimation.orientation.rows import FLAG_STILL
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_rotate,
                                           quat_rotate_inverse)
@@ -154,7 +154,7 @@ def turn_to_true_north(params, stamp, sample):
 
 def warm_up(params):
     """Compile, or load from the cache, what the first samples would otherwise wait for."""
-    estimator = OrientationEstimator(params.replace(alignment_duration=0.05))
+    estimator = OrientationEstimator(params.replace(**{"alignment.duration": 0.05}))
     for i in range(20):
         stamp = i * 10_000_000
         estimator.add_mag(stamp, np.array([0.0, 2e-5, -4e-5]))
@@ -234,7 +234,10 @@ class OrientationStream(Stream):
             CalibrationError: the samples do not determine it.
         """
         calibration = self._calibrator.result()
-        self.params = self.params.replace(**calibration.to_parameters())
+        changes = calibration.to_parameters()
+        if self.params.is_as_printed:
+            del changes["fusion.mag_offset_sd"]    # the printed method knows no such thing
+        self.params = self.params.replace(**changes)
         self.estimator = OrientationEstimator(self.params)
         self.restart()
         return calibration

@@ -267,7 +267,9 @@ def messages(samples, outcome, path_rate):
             stamp = int(stamp)
             yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", odometry, frame_id)
             yield SMOOTHED_IMU_TOPIC, stamp, IMU.encode(stamp, frame_id, imu)
-            yield SMOOTHED_FIX_TOPIC, stamp, fix_message(stamp, frame_id, *fix[:3], fix[3:])
+            latitude, longitude, height = fix[:3]
+            yield SMOOTHED_FIX_TOPIC, stamp, fix_message(stamp, frame_id, latitude, longitude,
+                                                         height, fix[3:])
     if len(samples):
         last = int(samples["stamp"][-1])
         yield PATH_TOPIC, last, _path(samples, path_rate)

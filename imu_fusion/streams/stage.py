@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
@@ -41,10 +42,10 @@ class Stage:
     outputs: Mapping[str, str]
     process_logs: Callable[..., Iterable[tuple[str, int, bytes]]]
     findings: Callable[[Mapping], Sequence[str]] = _no_findings
-    configure: Callable[["Stage", object], tuple["Stage", list]] | None = None
+    configure: Callable[["Stage", str | Path | None], tuple["Stage", list]] | None = None
     unusable: str = ""
 
-    def prepare(self, params_file=None) -> tuple["Stage", list]:
+    def prepare(self, params_file: str | Path | None = None) -> tuple["Stage", list]:
         """(Stage, parameters) under a parameter file, or None for defaults.
 
         Raises:
@@ -54,7 +55,7 @@ class Stage:
             return self.configure(self, params_file)
         return self, self.read_params(params_file)
 
-    def read_params(self, params_file=None) -> list:
+    def read_params(self, params_file: str | Path | None = None) -> list:
         """The objects of ``params`` in a parameter file (or None: defaults)."""
         params = parameters_for(self.params + self.node_params, self.node, params_file)
         return params[:len(self.params)]

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
-from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.messages import convert
-from imu_fusion.messages.typestore import TYPES
 from imu_fusion.messages.layouts import FIX, IMU, POSE, TWIST
+from imu_fusion.messages.typestore import TYPES
 
 STAMP = 1_700_000_123_456_789_012
 
@@ -70,7 +70,8 @@ def test_velocity_round_trip():
 
 def test_pose_round_trip():
     quat = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_quat()
-    log = convert.SAMPLE_TYPES[POSE.msgtype].read([convert.pose_message(STAMP, "world", quat, (4, 5, 6))])
+    message = convert.pose_message(STAMP, "world", quat, (4, 5, 6))
+    log = convert.SAMPLE_TYPES[POSE.msgtype].read([message])
     assert np.array_equal(log.quat_world_imu[0], quat) and list(log.position_world[0]) == [4, 5, 6]
 
 
@@ -84,6 +85,7 @@ def test_bool_is_what_rosbags_writes():
 def test_orientation_rows_give_roll_pitch_yaw():
     row = np.zeros(1, ORIENTATION_DTYPE)[0]
     row["quat_world_imu"] = Rotation.from_euler("ZYX", [0.3, -0.2, 0.1]).as_quat()
-    message = TYPES.deserialize_cdr(convert.rpy_message(row, "x"), "geometry_msgs/msg/Vector3Stamped")
+    message = TYPES.deserialize_cdr(convert.rpy_message(row, "x"),
+                                    "geometry_msgs/msg/Vector3Stamped")
     np.testing.assert_allclose([message.vector.x, message.vector.y, message.vector.z],
                                [0.1, -0.2, 0.3], atol=1e-15)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import MessageError
-from imu_fusion.estimation.orientation import state as st
-from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation import rows as st
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.streams import orientation as orientation_stream
 from imu_fusion.messages.orientation_status import (
     WORDS, bias_message, bias_values, flags_message, flags_value, lasting_flags)

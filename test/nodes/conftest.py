@@ -8,10 +8,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu
 
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.nodes.base import use_fast_heartbeats
 from imu_fusion.nodes.flow import FlowSink
+from imu_fusion.recordings.bag_writer import BagWriter
 
 START = 1_700_000_000_000_000_000
 STEP = 10_000_000  # ns

@@ -1,12 +1,12 @@
-"""The protocol of nodes/flow.py between nodes of this process."""
+"""The protocol of nodes/flow between nodes of this process."""
 
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64
 
+from imu_fusion.nodes.flow import END, NEXT, WINDOW, FlowSink, FlowSource, Relay, sensor_qos
 from imu_fusion.nodes.flow import sink as flow_sink
 from imu_fusion.nodes.flow import source as flow_source
-from imu_fusion.nodes.flow import END, NEXT, WINDOW, FlowSink, FlowSource, Relay, sensor_qos
 
 
 class Sender:

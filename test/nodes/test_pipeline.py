@@ -6,16 +6,16 @@ import pytest
 
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError, TopicError
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
-from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
 from imu_fusion.nodes.pipeline import run_pipeline
-from imu_fusion.nodes.smoothing_trigger import SmoothingTrigger
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
+from imu_fusion.nodes.smoothing_trigger import SmoothingTrigger
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
 from test.nodes.conftest import START, STEP, write_bag
 from test.nodes.test_smoother import write
 
@@ -94,7 +94,7 @@ def test_a_recording_without_fixes_is_refused_before_anything_starts(tmp_path):
 
 def test_a_bad_surface_is_refused_before_anything_starts(tmp_path):
     params, out = tmp_path / "params.yaml", tmp_path / "out"
-    params.write_text("smoother: {ros__parameters: {surface: nowhere}}")
+    params.write_text("smoother: {ros__parameters: {surface: {file: nowhere}}}")
     bag = write(tmp_path / "bag", 20)
     for call in (run_pipeline, batch.process):
         with pytest.raises(LayoutError, match="nowhere"):

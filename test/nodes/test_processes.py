@@ -11,11 +11,14 @@ import pytest
 from sensor_msgs.msg import Imu
 
 from imu_fusion.kernels import NOTICE
+from imu_fusion.messages.convert import imu_message
+from imu_fusion.nodes import processes
+from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
+from imu_fusion.nodes.pipeline import run_pipeline
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.messages.convert import imu_message
-from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
 from test.nodes.conftest import START, STEP, collector
+from test.nodes.test_smoother import write
 
 SCRIPTS = Path(sys.executable).parent
 # Killed processes leave shared memory behind; over UDP there is nothing to leave.
@@ -111,16 +114,32 @@ def test_user_errors_are_one_line_and_exit_code_1(node, parameters, text):
 
 def test_help_lists_the_parameters_and_wrong_arguments_are_refused():
     done = subprocess.run([SCRIPTS / "replayer", "--help"], env=ENVIRONMENT,
-                          capture_output=True, text=True, timeout=60)
+                          capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0 and "rate = 1.0 [at least 0]" in done.stdout
+    assert "~/pause, ~/resume, ~/step" in done.stdout
     done = subprocess.run([SCRIPTS / "replayer", "my.bag"], env=ENVIRONMENT,
-                          capture_output=True, text=True, timeout=60)
+                          capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1 and "unexpected argument 'my.bag'" in done.stderr
 
 
-def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, capsys):
+def test_kernels_are_compiled_before_any_node_starts(tmp_path, monkeypatch, capsys):
+    """Visibly, and Ctrl-C ends it."""
+    def interrupted(say):
+        say("compiling for this machine")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(processes, "compile_ahead", interrupted)
+    started = []
+    monkeypatch.setattr(NodeProcesses, "start", lambda self, node, **_: started.append(node))
+    with pytest.raises(KeyboardInterrupt):
+        run_pipeline(write(tmp_path / "bag", 20), tmp_path / "out")
+    assert not started and capsys.readouterr().err == "compiling for this machine\n"
+
+
+def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, monkeypatch, capsys):
     """A recorder without a session never ends; asked to, it closes its recording. What nodes say
     into their logs while they compile is passed on."""
+    monkeypatch.setattr(processes, "compile_ahead", lambda say: None)
     with NodeProcesses(tmp_path / "logs") as nodes:
         nodes.start("recorder", out=str(tmp_path / "bag"))
         deadline = time.monotonic() + 30.0

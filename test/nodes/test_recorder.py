@@ -8,10 +8,10 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Int64, String
 
 from imu_fusion.errors import BagError, ParameterError
-from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.nodes.flow import FlowSource
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
+from imu_fusion.recordings.bag_reader import open_bag
 from test.nodes.conftest import START, STEP, write_bag
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.messages.layouts import VECTOR3
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.recordings.inspect import inspect_topics
-from imu_fusion.messages.layouts import VECTOR3
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 START = 1_700_000_000_000_000_000

@@ -21,6 +21,7 @@ from imu_fusion.estimation.smoother.initial import attitude_from_vectors
 from imu_fusion.estimation.smoother.imu_input import ImuInput, prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
+from imu_fusion.estimation.smoother.measurements.gnss_fix import required
 from imu_fusion.estimation.smoother.measurements.registry import (FIX, MAG, MEASUREMENTS, VELOCITY,
                                                                   prepare_readings)
 from imu_fusion.estimation.smoother.measurements.surface_contact import holds
@@ -90,6 +91,7 @@ class ExtendedRts:
             raise EstimationError("method extended_rts knows hills only, no "
                                   f"{type(hill).__name__} (method: iterated)")
         prepared = prepare_imu(imu, params)
+        fix = required(fix)
         frame = reference_frame(hill, fix)
         if hill is not None and events is None:
             events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
@@ -114,7 +116,9 @@ class ExtendedRts:
         stamps = readings["stamp"][data.order]
         innovations = {m.name: (stamps[data.kind == kind], innovation[data.kind == kind])
                        for kind, m in enumerate(MEASUREMENTS) if np.any(data.kind == kind)}
-        jump = jump_result(hill, samples, prepared.log, events) if hill is not None else None
+        jump = None
+        if hill is not None and events is not None:
+            jump = jump_result(hill, samples, prepared.log, events)
         constraints = () if hill is None else hill.constraints()
         fits = surface_fits(constraints, samples, states, events, params)
         return SmootherResult(samples, frame, states, innovations, (cost,), 1, None, events, jump,
@@ -188,18 +192,20 @@ def _update(model, data, k, x, cov):
         State and covariance; the innovations, each by its standard deviation given those before
         it: readings first.
     """
-    innovation, jacobian, variance = [], [], []
+    deviation: list[float] = []
+    jacobian: list[np.ndarray] = []
+    variance: list[float] = []
     for i in range(data.start[k], data.start[k + 1]):
         predicted, h = model.output(data.kind[i], x)
-        innovation.extend(data.value[i] - predicted)
+        deviation.extend(data.value[i] - predicted)
         jacobian.extend(h)
         variance.extend(_R_READING[data.kind[i]])
     active = [name for name, mask in data.active.items() if mask[k]]
     for name, (value, h) in model.constraints(x, active).items():
-        innovation.append(-value)
+        deviation.append(-value)
         jacobian.append(h)
         variance.append(data.sigma[name] ** 2)
-    innovation, h = np.array(innovation), np.array(jacobian)
+    innovation, h = np.array(deviation), np.array(jacobian)
     spread = h @ cov @ h.T + np.diag(variance)
     gain = np.linalg.solve(spread, h @ cov).T
     x = x + gain @ innovation

@@ -105,13 +105,7 @@ def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np
             storage.delta[k - first] = delta
             storage.cov[k - first] = cov
         if has_interval:
-            if follow:
-                x[k + 1] = step.x_next[:n + 1]
-            else:
-                _carry_deviation(x[k + 1], delta, scratch, step, model)
-            propagate_cov(cov, scratch.matrix, step, model)
-            put_spread(recording.intervals[k].acc_noise, step)
-            add_noise(cov, recording.intervals[k].gyr_noise, step, model)
+            _to_next(x[k + 1], follow, delta, cov, recording.intervals[k], model, scratch)
             if store:
                 storage.f_vel[k - first] = step.f_vel[:, :n]
                 storage.f_att[k - first] = step.f_att[:, :n]
@@ -125,6 +119,19 @@ def _put_lever_arm(x, model, step):
     at = model.blocks.gnss_lever_arm
     for i in range(3):
         step.lever_arm[i] = model.lever_arm[i] if at < 0 else slow(x, at + i)
+
+
+@njit
+def _to_next(x_next, follow, delta, cov, interval, model, scratch):
+    """Carry deviation and covariance over an interval; the next nominal state, if it follows."""
+    step = scratch.step[0]
+    if follow:
+        x_next[:] = step.x_next[:len(x_next)]
+    else:
+        _carry_deviation(x_next, delta, scratch, step, model)
+    propagate_cov(cov, scratch.matrix, step, model)
+    put_spread(interval.acc_noise, step)
+    add_noise(cov, interval.gyr_noise, step, model)
 
 
 @njit

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import EstimationError, SampleError
-from imu_fusion.estimation.smoother.measurements.gnss_fix import NO_FIX, valid_fixes
+from imu_fusion.estimation.smoother.measurements.gnss_fix import valid_fixes
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
@@ -17,16 +17,13 @@ _LEAST = 10   # Imu samples: of fewer, steps and noise of a sample have no meani
 _FULL_SCALE = 0.999   # of a range from which on a reading counts as clipped: logs round it
 
 
-def reference_frame(surface: Surface | None, fix: FixLog | None) -> LocalFrame:
+def reference_frame(surface: Surface | None, fix: FixLog) -> LocalFrame:
     """The surface's frame, or one at the first valid fix.
 
     Raises:
-        EstimationError: no valid fix, or the surface is elsewhere.
+        EstimationError: the surface is elsewhere.
     """
-    valid = np.flatnonzero(valid_fixes(fix)) if fix is not None else np.empty(0, int)
-    if fix is None or not len(valid):
-        raise EstimationError(NO_FIX)
-    i = valid[0]
+    i = np.flatnonzero(valid_fixes(fix))[0]
     first = float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
     if surface is None:
         return LocalFrame(*first)

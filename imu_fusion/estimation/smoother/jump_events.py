@@ -20,7 +20,7 @@ _AIR = 300_000_000  # ns before the peak: the air, and the rise
 _RISE = 0.1         # s that the rise takes at most (Fang: 0.05 s)
 _AFTER = 50_000_000   # ns after the peak that are looked at
 _QUIET = 5          # least samples of the air, for a median
-_DEVIATIONS, _SHARE = 6.0, 0.1   # quiet: within so many median deviations, or this share of the peak
+_DEVIATIONS, _SHARE = 6.0, 0.1   # median deviations, or share of the peak: quiet within
 _STANDS_OUT = 3.0   # times what counts as quiet, above which a peak is one
 
 _NEAR_EDGE = 2_000_000_000   # ns from a take-off, within which the table edge is passed
@@ -53,16 +53,16 @@ def find_jump(imu: ImuLog, velocity: VelocityLog | None, takeoff: float | None =
         if at is not None and at > length:
             raise EstimationError(f"{name} is given as {at:g} s, but the Imu samples end at "
                                   f"{length:.1f} s")
-    stamps = [None if at is None else int(imu.stamp[0]) + round(at * 1e9)
-              for at in (takeoff, touchdown)]
-    if None in stamps:
+    if takeoff is None or touchdown is None:
         found = detect_jump(imu, velocity)
-        stamps = [detected if given is None else given
-                  for given, detected in zip(stamps, (found.takeoff, found.touchdown))]
-    if stamps[1] <= stamps[0]:
+    origin = int(imu.stamp[0])
+    events = JumpEvents(
+        found.takeoff if takeoff is None else origin + round(takeoff * 1e9),
+        found.touchdown if touchdown is None else origin + round(touchdown * 1e9))
+    if events.touchdown <= events.takeoff:
         raise EstimationError("the touch-down that was detected is before the take-off that was "
                               "given, or the reverse: give both (jump.takeoff, jump.touchdown)")
-    return JumpEvents(*stamps)
+    return events
 
 
 def detect_jump(imu: ImuLog, velocity: VelocityLog | None) -> JumpEvents:

@@ -63,6 +63,20 @@ def _interpolate(stamp, samples, name):
     return np.array([np.interp(at, since, column) for column in samples[name].T])
 
 
+def _in_run_speed(hill, samples, takeoff):
+    """Mean speed over the last metres before the edge and its standard deviation, None where
+    nothing is recorded there."""
+    before = samples[samples["stamp"] < takeoff]
+    table = before[hill.to_hill(before["position_world"])[:, 0] > -_IN_RUN]
+    if not len(table):
+        return None, None
+    speed = np.linalg.norm(table["vel_world"], axis=1)
+    # Errors of the velocity hardly change over 0.4 s.
+    i = len(table) // 2
+    return float(speed.mean()), _sd(table["vel_world"][i] / speed[i], table["cov_velocity"][i],
+                                    0.0, np.zeros(3))
+
+
 def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents) -> JumpResult:
     """Read the results of a jump off the smoothed samples.
 
@@ -80,7 +94,7 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
     Raises:
         EstimationError: the touch-down is not beyond the table.
     """
-    stamp, cov_velocity = samples["stamp"], samples["cov_velocity"]
+    cov_velocity = samples["cov_velocity"]
     takeoff, off_acc, edge = _in_air(samples, events.takeoff, after=True)
     landing, down_acc, touch = _in_air(samples, events.touchdown, after=False)
     x, _, _ = hill.to_hill(_interpolate(events.touchdown, samples, "position_world"))
@@ -99,19 +113,10 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
     length_sd = np.hypot(1.0, slope) * np.hypot(np.sqrt(cov_x[touch]),
                                                 timing * (forward @ landing))
     edge_timing = np.sqrt(cov_x[edge]) / (forward @ takeoff)
-    speed = np.linalg.norm(samples["vel_world"], axis=1)
     takeoff_speed, landing_speed = np.linalg.norm(takeoff), np.linalg.norm(landing)
     horizontal = np.hypot(*takeoff[:2])
     raised = np.array([*(-takeoff[2] * takeoff[:2] / horizontal), horizontal])
-    table = np.flatnonzero((stamp < events.takeoff)
-                           & (hill.to_hill(samples["position_world"])[:, 0] > -_IN_RUN))
-    in_run = in_run_sd = None
-    if len(table):
-        # Errors of the velocity hardly change over 0.4 s.
-        middle = table[len(table) // 2]
-        in_run = float(speed[table].mean())
-        in_run_sd = _sd(samples["vel_world"][middle] / speed[middle], cov_velocity[middle],
-                        0.0, np.zeros(3))
+    in_run, in_run_sd = _in_run_speed(hill, samples, events.takeoff)
     return JumpResult(
         takeoff_stamp=events.takeoff, touchdown_stamp=events.touchdown,
         in_run_speed=in_run, in_run_speed_sd=in_run_sd, takeoff_speed=float(takeoff_speed),

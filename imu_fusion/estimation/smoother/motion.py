@@ -109,7 +109,8 @@ def _differentiate(interval, half_turn, model, step):
     put_cross_matrix(middle, (step.force[0], step.force[1], step.force[2]), -dt, lever, 0)
     for i in range(3):
         for j in range(3):
-            f_att[i, ATT + j] = (half_turn[j, 0] * half_turn[0, i] + half_turn[j, 1] * half_turn[1, i]
+            f_att[i, ATT + j] = (half_turn[j, 0] * half_turn[0, i]
+                                 + half_turn[j, 1] * half_turn[1, i]
                                  + half_turn[j, 2] * half_turn[2, i])
             f_att[i, GYR_BIAS + j] = -dt * jacobian[i, j]
             f_vel[i, ATT + j] = (lever[i, 0] * half_turn[j, 0] + lever[i, 1] * half_turn[j, 1]

@@ -82,6 +82,7 @@ class Problem:
         self.contacts = np.empty(0, CONTACT)
         self._start()
         self._all_readings = readings
+        self._bound = np.zeros(len(MEASUREMENTS))
         self.attach()
 
     def _start(self) -> None:

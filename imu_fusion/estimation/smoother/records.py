@@ -25,22 +25,24 @@ READING = np.dtype([("stamp", "i8"), ("kind", "i8"), ("tau", "f8"), ("value", "f
 CONTACT = np.dtype([("residual", "f8"), ("position", "f8", 3), ("attitude", "f8", 3),
                     ("lever_arm", "f8", 3), ("sigma", "f8"), ("height", "?")], align=True)
 
-#: What stays the same over a recording: gravity at the origin (m/s^2), rate of the Earth (rad/s) and
-#: magnetic field (microtesla) in the world, antenna in the imu frame (m); first error index of each
-#: optional block, -1: absent; decay rate (1/s) and variance density of the walk of each error
+#: What stays the same over a recording: gravity at the origin (m/s^2), rate of the Earth (rad/s)
+#: and magnetic field (microtesla) in the world, antenna in the imu frame (m); first error index of
+#: each optional block, -1: absent; decay rate (1/s) and variance density of the walk of each error
 #: state; the ``n_columns`` error indices that velocity and attitude of the next sample depend on,
 #: besides the velocity.
 MODEL = np.dtype([("gravity", "f8"), ("earth_rate", "f8", 3), ("magnetic_field", "f8", 3),
-                  ("lever_arm", "f8", 3), ("blocks", [(name, "i8") for name in StateBlocks._fields]),
+                  ("lever_arm", "f8", 3),
+                  ("blocks", [(name, "i8") for name in StateBlocks._fields]),
                   ("decay_rate", "f8", MOST), ("walk", "f8", MOST), ("columns", "i8", MOST),
                   ("n_columns", "i8")], align=True)
 
 #: One interval, linearised about the state at its beginning. s; rate against the world and specific
 #: force in the imu frame, acceleration in the world; rotation vector of the interval, matrices
-#: R_world_imu at its beginning and in its middle; ``lever``: what an error of the attitude there adds
-#: to the velocity; antenna in the imu frame (m). ``f_vel``, ``f_att``: rows of the transition matrix F, f_vel without the identity of the velocity itself;
-#: ``decay``: factors of the slow states; ``spread``: covariance of the velocity step in world axes;
-#: ``x_next``: the state carried to the next sample.
+#: R_world_imu at its beginning and in its middle; ``lever``: what an error of the attitude there
+#: adds to the velocity; antenna in the imu frame (m). ``f_vel``, ``f_att``: rows of the transition
+#: matrix F, f_vel without the identity of the velocity itself; ``decay``: factors of the slow
+#: states; ``spread``: covariance of the velocity step in world axes; ``x_next``: the state carried
+#: to the next sample.
 STEP = np.dtype([("dt", "f8"), ("rate", "f8", 3), ("force", "f8", 3), ("acc_world", "f8", 3),
                  ("turn", "f8", 3), ("rotation", "f8", (3, 3)), ("middle", "f8", (3, 3)),
                  ("lever", "f8", (3, 3)), ("lever_arm", "f8", 3), ("f_vel", "f8", (3, MOST)),

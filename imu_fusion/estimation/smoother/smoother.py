@@ -9,6 +9,7 @@ from imu_fusion.estimation.smoother.initial import first_attitudes
 from imu_fusion.estimation.smoother.iterated import Solution, solve
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
+from imu_fusion.estimation.smoother.measurements.gnss_fix import required
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS, prepare_readings
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.problem import Problem
@@ -61,6 +62,7 @@ class Smoother:
             return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events,
                                                     initial_quat)
         prepared = prepare_imu(imu, params)
+        fix = required(fix)
         frame = reference_frame(surface, fix)
         constraints = surface.constraints() if surface is not None else ()
         if events is None and any(c.phase != "always" for c in constraints):
@@ -72,8 +74,9 @@ class Smoother:
                           StatePrior.of(params, measured))
         hill = surface if isinstance(surface, Hill) and events is not None else None
 
-        def refine(problem, events):
-            return refine_jump(hill, _positions(problem), prepared.log, events)
+        def refine(problem: Problem, events: JumpEvents) -> JumpEvents:
+            return events if hill is None else refine_jump(hill, _positions(problem), prepared.log,
+                                                           events)
 
         best = None
         for quat in first_attitudes(problem, mag, initial_quat)[:_STARTS]:
@@ -111,7 +114,7 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],
                                              problem.innovation[of_kind][:, :width])
     jump = None
-    if hill is not None:
+    if hill is not None and solution.events is not None:
         jump = jump_result(hill, at_surface(samples, states, problem.params), problem.imu.log,
                            solution.events)
     fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)

@@ -23,15 +23,16 @@ class Surroundings:
 
 
 def surroundings_of(params: SmootherParams, frame: LocalFrame, fix: FixLog, magnetic: bool
-                 ) -> Surroundings:
+                    ) -> Surroundings:
     """Gravity and, with a magnetometer, the magnetic field: as given, or those at the origin of the
     frame and the stamp of the first fix."""
-    gravity, field = params.gravity, params.magnetic_field
+    gravity = params.gravity
     if gravity is None:
         gravity = float(normal_gravity(frame.latitude_deg, frame.height))
-    if not magnetic:
-        field = np.zeros(3)
-    elif field is None:
+    field = np.zeros(3)
+    if magnetic and params.magnetic_field is not None:
+        field = np.array(params.magnetic_field)
+    elif magnetic:
         field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg, frame.height,
                                      decimal_year(fix.stamp[0]))
-    return Surroundings(gravity, earth_rate_world(frame.latitude_deg), np.array(field) * MICRO)
+    return Surroundings(gravity, earth_rate_world(frame.latitude_deg), field * MICRO)

@@ -29,7 +29,16 @@ Both topics carry diagnostic_msgs/DiagnosticStatus: ``name`` is the node,
 """
 
 from imu_fusion.nodes.flow.protocol import (
-    ACK_EVERY, BEGIN, DEPTH, END, NEXT, WINDOW, reliable_qos, sensor_qos, steady_timer)
+    ACK_EVERY,
+    BEGIN,
+    DEPTH,
+    END,
+    NEXT,
+    WINDOW,
+    reliable_qos,
+    sensor_qos,
+    steady_timer,
+)
 from imu_fusion.nodes.flow.relay import Relay
 from imu_fusion.nodes.flow.sink import FlowSink
 from imu_fusion.nodes.flow.source import FlowSource

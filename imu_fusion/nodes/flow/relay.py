@@ -8,23 +8,23 @@ from imu_fusion.nodes.flow.source import FlowSource
 class Relay:
     """Sink and source of a processing node, tied together.
 
-    ``stage`` (usually the node) has four methods:
+    ``processor`` (usually the node) has four methods:
 
     ``reset(topics)``: a session with these input topics begins.
     ``step()``: process one sample that may be processed; False if there is none.
     ``topic_ended(topic)``: nothing more comes on this input.
     ``finish()``: all inputs have ended and all samples are processed; publish the rest.
 
-    Samples wait in the stage while the outputs are full; outputs made by ``finish``
+    Samples wait in the processor while the outputs are full; outputs made by ``finish``
     may exceed the window: they wait in the outboxes.
     """
 
-    def __init__(self, node, stage, *, wait_for=(), window=WINDOW):
-        self._stage = stage
+    def __init__(self, node, processor, *, wait_for=(), window=WINDOW):
+        self._processor = processor
         self._finishing = None
         self.source = FlowSource(node, wait_for=wait_for, window=window, on_ready=self.pump)
         self.sink = FlowSink(
-            node, on_begin=self._begin, on_company=self._join, on_topic_end=stage.topic_ended,
+            node, on_begin=self._begin, on_company=self._join, on_topic_end=processor.topic_ended,
             on_end=self._end, hold=lambda: not self.source.ready(), confirm=False,
             ack_every=max(1, window // 4))
 
@@ -33,7 +33,7 @@ class Relay:
         return self.source.publisher(msg_type, topic, qos)
 
     def subscribe(self, msg_type, topic, callback, qos=None):
-        """``callback(cdr, info)`` stores a sample; the relay then calls ``stage.step``."""
+        """``callback(cdr, info)`` stores a sample; the relay then calls ``processor.step``."""
         def on_data(cdr, info):
             callback(cdr, info)
             self.pump()
@@ -41,11 +41,11 @@ class Relay:
 
     def pump(self):
         """Process what may be processed, as far as the outputs take it."""
-        while self.source.ready() and self._stage.step():
+        while self.source.ready() and self._processor.step():
             pass
         if self._finishing and self.source.ready():
             event, self._finishing = self._finishing, None
-            self._stage.finish()
+            self._processor.finish()
             self.source.end(event)
             self.sink.done()
         self.sink.release()
@@ -62,7 +62,7 @@ class Relay:
             self.source.begin(session.company)
         else:
             self.source.expect(session.company)
-        self._stage.reset(sorted({topic for s in feeding for topic in s.topics
+        self._processor.reset(sorted({topic for s in feeding for topic in s.topics
                                   if topic in self.sink.inboxes}))
 
     def _join(self, session):

@@ -6,8 +6,23 @@ from dataclasses import dataclass, field
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.nodes.flow.protocol import (
-    ACK, ACK_EVERY, ACK_QOS, ACK_TOPIC, BEGIN, COMPANY, DONE, NEXT, STATUS_HEARD, STATUS_TOPIC,
-    full_name, is_reliable, reliable_qos, status_message, steady_timer, subscribe_raw)
+    ACK,
+    ACK_EVERY,
+    ACK_QOS,
+    ACK_TOPIC,
+    BEGIN,
+    COMPANY,
+    DONE,
+    NEXT,
+    STATUS_HEARD,
+    STATUS_TOPIC,
+    full_name,
+    is_reliable,
+    reliable_qos,
+    status_message,
+    steady_timer,
+    subscribe_raw,
+)
 
 PATIENCE = 5.0  # s of silence after which the last messages of an ended session count as lost
 

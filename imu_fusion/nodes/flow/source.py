@@ -9,9 +9,24 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 from imu_fusion.nodes.flow.protocol import (
-    ACK_EVERY, ACK_QOS, ACK_TOPIC, BEGIN, COMPANY, DONE, END, RENEWED, STATUS_OFFERED,
-    STATUS_TOPIC, WINDOW, full_name, is_reliable, reliable_qos, status_message, steady_timer,
-    type_name)
+    ACK_EVERY,
+    ACK_QOS,
+    ACK_TOPIC,
+    BEGIN,
+    COMPANY,
+    DONE,
+    END,
+    RENEWED,
+    STATUS_OFFERED,
+    STATUS_TOPIC,
+    WINDOW,
+    full_name,
+    is_reliable,
+    reliable_qos,
+    status_message,
+    steady_timer,
+    type_name,
+)
 
 HEARSAY = 20.0  # s to discover a sink that another node knows; DDS forgets a dead one in 20 s
 _UNBOUNDED = float("inf")
@@ -27,7 +42,7 @@ class FlowPublisher:
         self.topic = publisher.topic_name
         self.sent = 0  # equals the DDS sequence number of the last message
         self.limit = _UNBOUNDED
-        self.outbox = deque()
+        self.outbox: deque = deque()
         self.qos = qos
         self._publisher = publisher
         self._source = source
@@ -162,10 +177,7 @@ class FlowSource:
         """Whether every topic may send (always, outside sessions)."""
         if self._settling or self._begin_after_drain:
             return False
-        for publisher in self._publishers.values():
-            if publisher.sent >= publisher.limit:
-                return False
-        return True
+        return all(publisher.sent < publisher.limit for publisher in self._publishers.values())
 
     def end(self, event=END):
         """End the session once all outboxes are empty; ``NEXT`` promises another one."""

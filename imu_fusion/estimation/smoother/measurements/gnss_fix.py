@@ -13,9 +13,6 @@ from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, POS, VEL, slow
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog
 
-NO_FIX = ("no valid GNSS fix: position cannot be estimated. Orientation alone is the job of the "
-          "orientation estimator")
-
 
 def valid_fixes(fix: FixLog) -> np.ndarray:
     """Mask (m,) of the fixes that say where they are."""
@@ -23,17 +20,25 @@ def valid_fixes(fix: FixLog) -> np.ndarray:
             & np.isfinite(fix.height))
 
 
+def required(fix: FixLog | None) -> FixLog:
+    """The log, if it holds a valid fix.
+
+    Raises:
+        EstimationError: none is valid.
+    """
+    if fix is None or not valid_fixes(fix).any():
+        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation alone "
+                              "is the job of the orientation estimator")
+    return fix
+
+
 def prepare(fix: FixLog, frame: LocalFrame, params: SmootherParams) -> Readings:
     """Valid fixes, as positions in the world.
 
     Raises:
-        EstimationError: none is valid.
         SampleError: see :func:`.gnss.roots` and :func:`.gnss.even_stamps`.
     """
-    fix = fix[valid_fixes(fix)]
-    if len(fix) == 0:
-        raise EstimationError(NO_FIX)
-    fix, stamp = chosen(fix, params)
+    fix, stamp = chosen(fix[valid_fixes(fix)], params)
     return Readings(stamp, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
                     roots(fix.cov_enu, params.gnss.fix_sd, params, "the fixes"),
                     squared_scale(params.gnss))

@@ -24,8 +24,8 @@ def prepare(mag: MagLog, frame: LocalFrame, params: SmootherParams) -> Readings:
 
 @njit
 def predict(x, tau, step, model, rows):
-    """Reading (3,) at ``tau`` s after the sample (Fang 2020, eq. 50), and its derivative (3, n), into
-    ``rows``, where that is zero before.
+    """Reading (3,) at ``tau`` s after the sample (Fang 2020, eq. 50), and its derivative (3, n),
+    into ``rows``, where that is zero before.
 
     With the field F in sensor axes: (1 + s) (F - tau w x F) + b. What the errors of the
     gyroscope turn F by within tau (0.5 uT per rad/s at 10 ms) is left out of h. Residuals are

@@ -44,7 +44,6 @@ def prepare_readings(logs: dict[str, Log | None], frame: LocalFrame, params: Smo
         logs: by the name of the measurement; None: no such sensor.
 
     Raises:
-        EstimationError: no fix at all.
         SampleError: covariances or stamps that cannot be.
     """
     parts = [np.empty(0, READING)]

@@ -42,12 +42,11 @@ def holds(constraint: Constraint, stamp: np.ndarray, events: JumpEvents | None,
     """
     late = np.int64(round(margin * 1e9)) if constraint.height else np.int64(0)
     active = np.ones(len(stamp), bool)
-    if constraint.phase != "always" and events is None:
-        raise ValueError(f"constraint {constraint.name} holds in a part of a jump: give events")
-    if constraint.phase == "in_run":
-        active = stamp <= events.takeoff - late
-    elif constraint.phase == "landing":
-        active = stamp >= events.touchdown + late
+    if constraint.phase != "always":
+        if events is None:
+            raise ValueError(f"constraint {constraint.name} holds in a part of a jump: give events")
+        active = (stamp <= events.takeoff - late if constraint.phase == "in_run" else
+                  stamp >= events.touchdown + late)
     if windows:
         # An odd number of bounds passed: inside of a window.
         bounds = np.round(np.array(windows) * 1e9).astype(np.int64)
