@@ -12,8 +12,7 @@ from pathlib import Path
 import imu_fusion
 from benchmarks import architecture
 from benchmarks.readme import fill
-from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.params import AccelerometerParams
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.base import Node
 from imu_fusion.parameters.declare import fields_of, is_group, markdown_table
@@ -22,8 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 WRITTEN_BY = "<!-- written by python -m benchmarks.reference -->\n"
 # Parameters of single sensors, of which there may be any number: prefix to class.
-PER_SENSOR = {"acceleration_field_estimator": {"accelerometers.<name>.": AccelerometerParams,
-                                               "gyroscope.": GyroscopeParams}}
+PER_SENSOR = {"acceleration_field_estimator": {"accelerometers.<name>.": AccelerometerParams}}
 
 
 def node_class(name):
@@ -67,6 +65,22 @@ def _tables(cls):
     return parts
 
 
+def renamed():
+    """The page of parameters that have been renamed."""
+    parts = [WRITTEN_BY, "# Renamed parameters\n",
+             "A parameter file with an old name is refused, with the new one.\n"]
+    for name in NODES:
+        names = {old: new for cls in node_class(name).PARAMETERS
+                 for old, new in cls.OLD_NAMES.items()}
+        if names:
+            # Where there are two new names, with words between them, the names are in quotes.
+            rows = [f"| `{old}` | `{new}` |".replace("' ", "` ").replace(" '", " `")
+                    for old, new in sorted(names.items())]
+            parts += [f"## {name}\n",
+                      "\n".join(["| until 0.1.0 | now |", "|---|---|", *rows]) + "\n"]
+    return "\n".join(parts)
+
+
 def _title(cls):
     """OrientationOutputParams: Orientation output."""
     words = re.findall("[A-Z][a-z]*", cls.__name__.removesuffix("Params"))
@@ -96,6 +110,7 @@ def rooms():
 def pages():
     """dict of path to the text that belongs there."""
     found = {DOCS / "parameters" / f"{name}.md": parameters(name) for name in NODES}
+    found[DOCS / "parameters" / "renamed.md"] = renamed()
     found[DOCS / "conventions.md"] = conventions()
     found[DOCS / "images" / "architecture.svg"] = architecture.svg()
     page = DOCS / "architecture.md"

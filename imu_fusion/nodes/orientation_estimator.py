@@ -59,18 +59,21 @@ class OrientationEstimatorNode(EstimatorNode):
         output = self.params(OrientationOutputParams)
         self._broadcast = transform_broadcast(self) if output.publish_tf else None
         warm_up(self.params(OrientationParams))
-        self.attach(OrientationStream(
-            self.params(OrientationParams), output, self.emit,
-            self.get_logger().warning), OUTPUTS)
+        self.attach(OrientationStream(self.params(OrientationParams), output,
+                                      self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
             self.create_service(Trigger, f"~/{name}",
                                 lambda _, response, action=action: self._answer(response, action))
 
-    def emit(self, topic, stamp, cdr):
-        super().emit(topic, stamp, cdr)
-        if self._broadcast is not None and topic == ORIENTATION_TOPIC:
-            self._broadcast(transform(cdr, self.params(OrientationOutputParams).fixed_frame))
+    def publish(self, made):
+        super().publish(made)
+        if self._broadcast is not None:
+            frame = self.params(OrientationOutputParams).fixed_frame
+            for part in made:
+                if part.topic == ORIENTATION_TOPIC:
+                    for cdr in part.cdrs:
+                        self._broadcast(transform(cdr, frame))
 
     def summary(self):
         return self._stream.estimator.summary()

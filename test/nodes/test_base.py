@@ -23,8 +23,13 @@ class Numbers(Parameters):
 
 
 @dataclass(frozen=True)
+class Initial(Parameters):
+    mode: str = param("still", doc="how to start", choices=("still", "given"))
+
+
+@dataclass(frozen=True)
 class More(Parameters):
-    initial__mode: str = param("still", doc="how to start", choices=("still", "given"))
+    initial: Initial = Initial()
 
 
 class Example(Node):
@@ -44,10 +49,10 @@ def test_defaults_without_any_parameter(graph):
 
 def test_given_values_of_both_dataclasses(graph):
     node = graph.start(Example, gain=4.5, window=7, axis=[1.0, 0.0, 0.0], names=["a", "b"],
-                       fast=True, initial__mode="given", origin=1.5)
+                       fast=True, origin=1.5, **{"initial.mode": "given"})
     assert node.params(Numbers) == Numbers(gain=4.5, window=7, axis=(1.0, 0.0, 0.0),
                                            names=("a", "b"), fast=True, origin=1.5)
-    assert node.params(More).initial__mode == "given"
+    assert node.params(More).initial.mode == "given"
     assert node.get_parameter("origin").value == 1.5
 
 
@@ -82,7 +87,7 @@ def test_descriptors_carry_meaning_bounds_and_read_only(graph):
     ({"window": 2.5}, "'window'.*2.5 is not an integer"),
     ({"axis": [1.0, 2.0]}, "'axis'.*has 2 elements"),
     ({"fast": 1}, "'fast'.*1 is not true or false"),
-    ({"initial__mode": "x"}, "'initial.mode'.*one of still, given"),
+    ({"initial.mode": "x"}, "'initial.mode'.*one of still, given"),
     ({"gian": 1.0}, r"unknown parameter 'gian'; known: .*gain.*\(from node example\)"),
 ])
 def test_bad_values_are_refused_with_name_value_and_bounds(graph, given, text):
