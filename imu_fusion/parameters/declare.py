@@ -85,6 +85,28 @@ class ParameterInfo:
             parts.append(" or ".join(map(str, lengths)) + " elements")
         return ", ".join(parts)
 
+    @property
+    def unset(self) -> Any:
+        """What stands for "unset" (or for an empty list) in ROS, which has no such values: nan, -1,
+        an empty string, or a list of one of these. None where the parameter always has a value."""
+        if not (self.optional or (self.is_tuple and self.length is None)):
+            return None
+        stand_in = {float: math.nan, int: -1, str: "", bool: None}[self.element]
+        return (stand_in,) if self.is_tuple else stand_in
+
+    def _is_unset(self, value: Any) -> bool:
+        if self.optional and (value is None or value == "null"):    # rcl reads null as a string
+            return True
+        unset = self.unset
+        if unset is None or isinstance(value, (bool, bytes)):
+            return False
+        if self.is_tuple:
+            if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 1:
+                return False
+            (value,), (unset,) = value, unset
+        return value == unset or (self.element is float and isinstance(value, float)
+                                  and math.isnan(value))
+
     def check(self, value: Any, source: str = "") -> Any:
         """Return ``value`` in this parameter's type, or raise ParameterError."""
         where = f" (from {source})" if source else ""
@@ -96,9 +118,9 @@ class ParameterInfo:
             raise ParameterError(
                 f"parameter '{self.name}'{where}: {value!r} {why}{allowed}{unit}")
 
+        if self._is_unset(value):
+            return None if self.optional else ()
         if value is None:
-            if self.optional:
-                return None
             refuse("is not a value")
         if not self.is_tuple:
             return self._check_element(value, refuse)

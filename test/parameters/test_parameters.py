@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import pytest
+import yaml
 
 from imu_fusion.errors import ParameterError
 from imu_fusion.parameters.declare import Parameters, markdown_table, param
-from imu_fusion.parameters.file import parameters_for
+from imu_fusion.parameters.file import load, parameters_for
 
 
 @dataclass(frozen=True)
@@ -121,3 +122,11 @@ def test_table_lists_every_parameter_with_unit_and_bounds():
     table = markdown_table(Example)
     assert "| `noise` | 0.001 | rad/s | 0 to 1 | Noise. |" in table
     assert "| `limits` | unset |" in table and "`initial.mode`" in table
+
+
+def test_a_file_as_launch_ros_writes_it_is_read(tmp_path):
+    """launch_ros dumps its lists as tuples, with a tag of Python's."""
+    path = tmp_path / "launch_params.yaml"
+    path.write_text(yaml.dump({"/**": {"ros__parameters": {"axis": (1.0, 2.0), "names": ("a",)}}}))
+    assert "!!python/tuple" in path.read_text()
+    assert load(path) == {"**": {"axis": [1.0, 2.0], "names": ["a"]}}
