@@ -330,14 +330,11 @@ def translate(file: str, out: str | None) -> None:
     Prints it, or writes it to --out. What has no counterpart here is listed with the reason, and so
     are names that are not imu_tools' own: then the exit code is 1.
     """
-    import yaml
-
-    from imu_fusion.parameters.file import parameters_for
+    from imu_fusion.parameters.file import dump, parameters_for
     from imu_fusion.parameters.imu_tools import translate as translated
     from imu_fusion.streams.registry import STAGES
     result = translated(file)
-    text = yaml.safe_dump({"orientation_estimator": {"ros__parameters": result.values}},
-                          sort_keys=False, default_flow_style=None)
+    text = dump("orientation_estimator", result.values)
     for line in result.left_out:
         click.echo(f"no counterpart: {line}", err=True)
     for name in result.unknown:

@@ -7,7 +7,6 @@ a counterpart is translated, and of all the rest it is said why it has none.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from imu_fusion.errors import ParameterError
@@ -51,7 +50,7 @@ class Translation:
     unknown: list[str] = field(default_factory=list)
 
 
-def translate(path: str | Path) -> Translation:
+def translate(path: str) -> Translation:
     """What a parameter file of imu_tools means here.
 
     Raises:
@@ -62,7 +61,7 @@ def translate(path: str | Path) -> Translation:
     if not given:
         raise ParameterError(f"{path}: holds no parameters; expected a node name with "
                              "ros__parameters below it, such as imu_filter:")
-    return _translated(given, str(path))
+    return _translated(given, path)
 
 
 def _translated(given: Mapping[str, Any], source: str) -> Translation:

@@ -43,7 +43,7 @@ def file(tmp_path):
 
 
 def test_what_has_a_counterpart_is_translated_with_its_unit(file):
-    values = translate(file).values
+    values = translate(str(file)).values
     assert values == {
         "publish_tf": True, "fixed_frame": "odom", "world_frame": "ned",
         "declination_deg": pytest.approx(math.degrees(0.05)),
@@ -52,7 +52,7 @@ def test_what_has_a_counterpart_is_translated_with_its_unit(file):
 
 
 def test_all_that_has_none_is_named_unless_it_asks_for_nothing(file):
-    result = translate(file)
+    result = translate(str(file))
     assert [line.partition(":")[0] for line in result.left_out] == [
         "use_mag", "constant_dt", "gain", "zeta", "orientation_stddev"]
     assert result.unknown == []
@@ -88,4 +88,4 @@ def test_files_that_say_nothing_are_refused(tmp_path, content, text):
     path = tmp_path / "x.yaml"
     path.write_text(content)
     with pytest.raises(ParameterError, match=text):
-        translate(path)
+        translate(str(path))
