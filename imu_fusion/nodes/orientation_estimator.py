@@ -1,6 +1,8 @@
 """The orientation estimator as a node: decode, one call, encode."""
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import yaml
 from builtin_interfaces.msg import Time
@@ -10,15 +12,19 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import ImuFusionError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
-from imu_fusion.streams.orientation import (ORIENTATION_TOPIC, OUTPUTS,
-                                                    OrientationOutputParams, OrientationStream,
-                                                    warm_up)
-from imu_fusion.streams.stream import EstimatorNodeParams
-from imu_fusion.nodes.base import run_node
+from imu_fusion.nodes.base import Node, run_node
 from imu_fusion.nodes.estimator import EstimatorNode
+from imu_fusion.streams.orientation import (
+    ORIENTATION_TOPIC,
+    OUTPUTS,
+    OrientationOutputParams,
+    OrientationStream,
+    warm_up,
+)
+from imu_fusion.streams.stream import EstimatorNodeParams
 
 
-def transform_broadcast(node):
+def transform_broadcast(node: Node) -> Callable[[TransformStamped], None]:
     """The function that broadcasts a TransformStamped.
 
     Raises:
@@ -33,7 +39,7 @@ def transform_broadcast(node):
     return TransformBroadcaster(node).sendTransform
 
 
-def transform(cdr, fixed_frame):
+def transform(cdr: bytes, fixed_frame: str) -> TransformStamped:
     """The geometry_msgs/TransformStamped from ``fixed_frame`` to an Imu message's frame."""
     stamp, frame_id, values = IMU.decode(cdr)
     message = TransformStamped(child_frame_id=frame_id)
@@ -64,18 +70,17 @@ class OrientationEstimatorNode(EstimatorNode):
             self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
-            self.create_service(Trigger, f"~/{name}",
-                                lambda _, response, action=action: self._answer(response, action))
+            self.create_service(Trigger, f"~/{name}", self._answering(action))
 
-    def emit(self, topic, stamp, cdr):
+    def emit(self, topic: str, stamp: int, cdr: bytes) -> None:
         super().emit(topic, stamp, cdr)
         if self._broadcast is not None and topic == ORIENTATION_TOPIC:
             self._broadcast(transform(cdr, self.params(OrientationOutputParams).fixed_frame))
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         return self._stream.estimator.summary()
 
-    def apply(self, params):
+    def apply(self, params: Mapping[type, Any]) -> None:
         self._stream.change(params[OrientationParams])
 
     def _restart(self):
@@ -95,14 +100,17 @@ class OrientationEstimatorNode(EstimatorNode):
                 "now on")
 
     @staticmethod
-    def _answer(response, action):
-        try:
-            response.message, response.success = action(), True
-        except ImuFusionError as error:
-            response.message, response.success = str(error), False
-        return response
+    def _answering(action):
+        """A service callback: the answer is what ``action()`` says, or the reason why not."""
+        def answer(_, response):
+            try:
+                response.message, response.success = action(), True
+            except ImuFusionError as error:
+                response.message, response.success = str(error), False
+            return response
+        return answer
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(OrientationEstimatorNode, args)

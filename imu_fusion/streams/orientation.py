@@ -1,7 +1,9 @@
 """The orientation estimator between its topics, live and in batch."""
 
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -9,18 +11,26 @@ from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation.rows import FLAG_STILL
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_rotate,
-                                          quat_rotate_inverse)
-from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_message,
-                                         orientation_message, rpy_message)
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse
+from imu_fusion.messages.convert import (
+    GYROSCOPE_FIRST,
+    SAMPLE_TYPES,
+    bool_message,
+    orientation_message,
+    rpy_message,
+)
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
-from imu_fusion.messages.orientation_status import (FLAGS_TYPE, bias_message, flags_message,
-                                                    lasting_flags)
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import EstimatorNodeParams, Stream
+from imu_fusion.messages.orientation_status import (
+    FLAGS_TYPE,
+    bias_message,
+    flags_message,
+    lasting_flags,
+)
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import MagLog, checks
-from imu_fusion.sensors.magnetometer_calibration import MagCalibrator
+from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import EstimatorNodeParams, Stream
 
 FIX_TOPIC = "fix"
 MAG_TOPIC = "imu/mag"
@@ -53,8 +63,9 @@ class OrientationOutputParams(Parameters):
                            doc="Gravity that remove_gravity_vector takes out.")
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
-    publish_tf: bool = param(False, doc="Also broadcast the orientation as the transform from "
-                                        "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
+    publish_tf: bool = param(
+        False, doc="Also broadcast the orientation as the transform from fixed_frame to the Imu's "
+                   "frame (node only; needs tf2_ros).")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
 
 
@@ -81,9 +92,9 @@ class _Writer:
         self._flags = None
         self._next_bias = None
         self.turn = 0.0
-        self.yaw = None
+        self.yaw: float | None = None
 
-    def messages(self, rows, frame_id):
+    def messages(self, rows: np.ndarray, frame_id: str) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, stamp, cdr)."""
         for row in rows:
             stamp = int(row["stamp"])
@@ -103,18 +114,24 @@ class _Writer:
             east = quat_rotate(row["quat_world_imu"], (1.0, 0.0, 0.0))
             self.yaw = math.atan2(self._up * east[1], east[0])
 
-    def corrected(self, rows, frame_id):
+    def corrected(self, rows: np.ndarray, frame_id: str) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, stamp, cdr) of rows that looking ahead has corrected."""
         for row in rows:
             yield SMOOTHED_TOPIC, int(row["stamp"]), self._orientation(row, frame_id)[1]
 
-    def restart(self):
+    def restart(self) -> None:
         """What comes next is another stretch, perhaps at earlier stamps."""
         self.turn = 0.0
         self._next_bias = None
 
-    def set_yaw(self, yaw):
-        """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
+    def set_yaw(self, yaw: float) -> None:
+        """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``.
+
+        Raises:
+            EstimationError: there is no orientation yet.
+        """
+        if self.yaw is None:
+            raise EstimationError("no orientation yet: nothing to set the heading of")
         self.turn += yaw - self.yaw
 
     def _orientation(self, row, frame_id):
@@ -134,7 +151,8 @@ class _Writer:
         return row
 
 
-def turn_to_true_north(params, stamp, sample):
+def turn_to_true_north(params: OrientationParams, stamp: int,
+                       sample: np.ndarray) -> float | None:
     """Turn (rad) from magnetic to true north at a fix, or None if there is nothing to do.
 
     Args:
@@ -152,7 +170,7 @@ def turn_to_true_north(params, stamp, sample):
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
-def warm_up(params):
+def warm_up(params: OrientationParams) -> None:
     """Compile, or load from the cache, what the first samples would otherwise wait for."""
     estimator = OrientationEstimator(params.replace(**{"alignment.duration": 0.05}))
     for i in range(20):
@@ -172,25 +190,27 @@ class OrientationStream(Stream):
 
     same_frame = (IMU_TOPIC, MAG_TOPIC)
 
-    def __init__(self, params=OrientationParams(), output=OrientationOutputParams(), emit=None,
-                 warn=lambda text: None):
+    def __init__(self, params: OrientationParams = OrientationParams(),
+                 output: OrientationOutputParams = OrientationOutputParams(),
+                 emit: Callable[[str, int, bytes], object] = lambda *message: None,
+                 warn: Callable[[str], object] = lambda text: None) -> None:
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator = MagCalibrator()
-        self._next_calibration = None
+        self._next_calibration: int | None = None
         super().__init__(INPUTS, emit, warn)
 
-    def reset(self, session_topics=None):
+    def reset(self, session_topics: Sequence[str] | None = None) -> None:
         self._writer = _Writer(self.params, self.output)
         super().reset(session_topics)
 
-    def restart(self):
+    def restart(self) -> None:
         self.estimator.reset()
         self._writer.restart()
         self._knows_north = False
         self._has_force = False
 
-    def take(self, topic, stamp, sample):
+    def take(self, topic: str, stamp: int, sample: np.ndarray) -> None:
         if topic == IMU_TOPIC:
             force = _without_lost(sample[None, 3:], self._has_force)[0]
             self._has_force |= bool(force.any())
@@ -205,26 +225,24 @@ class OrientationStream(Stream):
         elif not self._knows_north:
             self._find_north(stamp, sample)
 
-    def flush(self):
+    def flush(self) -> None:
         self._write(self.estimator.finish())
 
-    def change(self, params):
+    def change(self, params: OrientationParams) -> None:
         """Go on with other values of parameters that may change at run time."""
         self.params = params
         self.estimator.set_params(params)
 
-    def set_heading(self, yaw):
+    def set_heading(self, yaw: float) -> None:
         """Call the present yaw ``yaw`` (rad, counter-clockwise from above).
 
         Raises:
             EstimationError: there is no orientation yet.
         """
-        if self._writer.yaw is None:
-            raise EstimationError("no orientation yet: nothing to set the heading of")
         self._writer.set_yaw(yaw)
         self._knows_north = True
 
-    def calibrate_magnetometer(self):
+    def calibrate_magnetometer(self) -> MagCalibration:
         """Calibrate from the samples since the start and start anew with the result.
 
         Returns:
@@ -242,7 +260,7 @@ class OrientationStream(Stream):
         self.restart()
         return calibration
 
-    def look_at(self, topic, logs):
+    def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
         if topic == IMU_TOPIC:
             found = checks.check_acceleration(logs[topic].acc, logs[topic].stamp, topic)
         elif topic == MAG_TOPIC:
@@ -273,7 +291,7 @@ class OrientationStream(Stream):
                 self.emit(*message)
 
 
-def findings(logs):
+def findings(logs: Mapping[str, Any]) -> list[str]:
     """What looks wrong with whole logs: texts.
 
     Args:
@@ -286,7 +304,8 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def process_logs(logs, report, params, output):
+def process_logs(logs: Mapping[str, Any], report: Any, params: OrientationParams,
+                 output: OrientationOutputParams) -> Iterator[tuple[str, int, bytes]]:
     """The messages that :class:`OrientationStream` emits for a session, from whole logs.
 
     Args:

@@ -20,6 +20,7 @@ predictions and updates can be written to a tape, which the smoother reads backw
 import math
 
 import numpy as np
+
 from imu_fusion.kernels import njit
 
 # The first index of each part; the nominal values are fields of state.STATE.

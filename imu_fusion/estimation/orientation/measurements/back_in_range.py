@@ -1,8 +1,7 @@
 """The first sample of a gyroscope axis back within its limit tells what its clipped rate was."""
 
-from imu_fusion.kernels import njit
-
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.kernels import njit
 
 NAME = "back in range"
 # rad/s: what the rate changes by from the last clipped sample to the first that is not, beyond the
