@@ -47,7 +47,9 @@ from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 from imu_fusion.kernels import njit
 
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
-_BURST_SHARE = 0.1         # of the block, while an axis is at its limit: it changes by its size
+# Of the block, while an axis is at its limit: its angular acceleration is forgotten in the time of
+# two whole blocks.
+_BURST_SHARE = 0.1
 _DISTURBED = 0.5           # weight (10) below which a sample is flagged as disturbed
 _STILL_LOCAL_RATE = 1e-3   # 1/s: at rest the local field is forgotten in a quarter of an hour
 _BIAS_SD_FLOOR = 2e-4      # rad/s: a first second at rest shows no bias better than that
@@ -269,11 +271,11 @@ def _end_block(s, p, tape):
     correct(s, p, error, tape)
     _add_error(s, p, error)
     if len(tape):
-        t = tape[0]
         for i in range(es.N):
+            source, target = s.cov[i], tape[0].cov[i]    # row by row: as fast as memory
             for j in range(es.N):
-                t.cov[i, j] = s.cov[i, j]
-        t.turned = s.world_turned
+                target[j] = source[j]
+        tape[0].turned = s.world_turned
     s.world_turned = False
     s.block_start = s.stamp
     s.block = _NO_BLOCK[0]
