@@ -67,6 +67,22 @@ def _tables(cls):
     return parts
 
 
+def renamed():
+    """The page of parameters that have been renamed."""
+    parts = [WRITTEN_BY, "# Renamed parameters\n",
+             "A parameter file with an old name is refused, with the new one.\n"]
+    for name in NODES:
+        names = {old: new for cls in node_class(name).PARAMETERS
+                 for old, new in cls.OLD_NAMES.items()}
+        if names:
+            # Where there are two new names, with words between them, the names are in quotes.
+            rows = [f"| `{old}` | `{new}` |".replace("' ", "` ").replace(" '", " `")
+                    for old, new in sorted(names.items())]
+            parts += [f"## {name}\n",
+                      "\n".join(["| until 0.1.0 | now |", "|---|---|", *rows]) + "\n"]
+    return "\n".join(parts)
+
+
 def _title(cls):
     """OrientationOutputParams: Orientation output."""
     words = re.findall("[A-Z][a-z]*", cls.__name__.removesuffix("Params"))
@@ -96,6 +112,7 @@ def rooms():
 def pages():
     """dict of path to the text that belongs there."""
     found = {DOCS / "parameters" / f"{name}.md": parameters(name) for name in NODES}
+    found[DOCS / "parameters" / "renamed.md"] = renamed()
     found[DOCS / "conventions.md"] = conventions()
     found[DOCS / "images" / "architecture.svg"] = architecture.svg()
     page = DOCS / "architecture.md"

@@ -5,8 +5,6 @@ a person can read on the command line and a report can shade spans from. The gyr
 bias as a geometry_msgs/TwistWithCovarianceStamped.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from imu_fusion.estimation.orientation import rows as st
@@ -28,15 +26,23 @@ _MAG_FLAGS = st.FLAG_MAG_DISTURBED | st.FLAG_MAG_SATURATED
 _MAG_SEEN = _MAG_FLAGS | st.FLAG_MAG_USED
 
 
-def lasting_flags(flags: int, before: int) -> int:
-    """The flags of a row that are in ``WORDS``; what a magnetometer sample showed lasts until
-    the next one. before: the result for the row before."""
-    if not flags & _MAG_SEEN:
-        flags |= before & _MAG_FLAGS
-    return flags & _LASTING
+def lasting_flags(flags, before):
+    """The flags of rows that are in ``WORDS``; what a magnetometer sample showed lasts until the
+    next one.
+
+    Args:
+        flags: (n,) of the rows. before: the result for the row before the first.
+
+    Returns:
+        (n,) int64
+    """
+    flags = np.asarray(flags, dtype=np.int64)
+    shown = np.maximum.accumulate(np.where(flags & _MAG_SEEN, np.arange(len(flags)), -1))
+    last = np.where(shown < 0, before, flags[np.maximum(shown, 0)])
+    return (flags | last & _MAG_FLAGS) & _LASTING
 
 
-def flags_message(stamp: int, frame_id: str, flags: int) -> bytes:
+def flags_message(stamp, frame_id, flags):
     """CDR bytes of a diagnostic_msgs/DiagnosticArray. stamp: int ns; flags: of WORDS."""
     words = [word for flag, word in WORDS.items() if flags & flag]
     return diagnostics_message(
@@ -45,7 +51,7 @@ def flags_message(stamp: int, frame_id: str, flags: int) -> bytes:
         bool(flags & _WORRIES), frame_id)
 
 
-def flags_value(cdr: bytes) -> tuple[int, int]:
+def flags_value(cdr):
     """(stamp int ns, flags) of a message of :func:`flags_message`.
 
     Raises:
@@ -55,7 +61,7 @@ def flags_value(cdr: bytes) -> tuple[int, int]:
     return stamp, sum(flag for flag, word in WORDS.items() if values.get(word) == "True")
 
 
-def bias_message(row: np.void, frame_id: str) -> bytes:
+def bias_message(row, frame_id):
     """CDR bytes of the geometry_msgs/TwistWithCovarianceStamped with the gyroscope bias of one
     row as its angular part, rad/s in imu axes; the linear part is absent."""
     cov = np.zeros((6, 6))
@@ -64,7 +70,7 @@ def bias_message(row: np.void, frame_id: str) -> bytes:
     return TWIST.encode(row["stamp"], frame_id, [0.0, 0.0, 0.0, *row["gyr_bias"], *cov.ravel()])
 
 
-def bias_values(messages: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bias_values(messages):
     """Stamps (n,) int64 ns, biases and standard deviations (n, 3) rad/s of bias messages."""
     stamp, _, values = TWIST.decode_many(messages)
     variance = np.diagonal(values[:, TWIST["covariance"]].reshape(-1, 6, 6), axis1=1, axis2=2)

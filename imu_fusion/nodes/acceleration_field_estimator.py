@@ -23,8 +23,7 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         for cls in NODE_PARAMETERS[1:]:
             values.update(self.params(cls).to_mapping())
         config = FieldConfiguration.from_mapping(values, f"node {self.get_name()}")
-        self.attach(AccelerationFieldStream(config, emit=self.emit,
-                                            warn=self.get_logger().warning), OUTPUTS)
+        self.attach(AccelerationFieldStream(config, self.get_logger().warning), OUTPUTS)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/smooth", self._on_smooth)
 
@@ -41,7 +40,9 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         if self._stream.config.field.mode != "smoothed":
             response.message = "mode is causal: nothing is held back; start with mode:=smoothed"
             return response
-        count = self._stream.smooth()
+        made = self._stream.smooth()
+        self.publish(made)
+        count = len(made[0].stamp) if made else 0
         response.success = count > 0
         response.message = (f"{count} samples smoothed and published" if count
                             else "no samples since the last time")

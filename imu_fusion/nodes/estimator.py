@@ -10,7 +10,7 @@ from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
-from imu_fusion.streams.stream import EstimatorNodeParams, Stream
+from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream, one_by_one
 
 
 class EstimatorNode(Node):
@@ -34,15 +34,18 @@ class EstimatorNode(Node):
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()
         self._names = {}  # resolved name -> ours
+        self._waiting: dict[str, list[bytes]] = {}  # topic -> messages that have come since the last step
         for topic, kind in stream.inputs.items():
             inbox = self._relay.subscribe(message_class(kind.layout.msgtype), topic,
-                                          lambda cdr, _, topic=topic: stream.push(topic, cdr), qos)
+                                          lambda cdr, _, topic=topic: self._waiting.setdefault(
+                                              topic, []).append(cdr), qos)
             self._names[inbox.topic] = topic
         self.start_diagnostics(self._status)
 
-    def emit(self, topic: str, stamp: int, cdr: bytes) -> None:
-        """Publish what the stream has made."""
-        self._outputs[topic].publish(cdr)
+    def publish(self, made: Sequence[Messages]) -> None:
+        """Publish what the stream has made: a list of Messages."""
+        for topic, _, cdr in one_by_one(made):
+            self._outputs[topic].publish(cdr)
 
     def summary(self) -> dict:
         """Values of the estimator for diagnostics; subclasses add theirs."""
@@ -54,27 +57,33 @@ class EstimatorNode(Node):
         self._stream.reset([self._names[topic] for topic in topics])
 
     def step(self) -> bool:
-        return self._stream.step()
+        waiting, self._waiting = self._waiting, {}
+        if waiting:
+            self.publish(self._stream.take(waiting))
+        return bool(waiting)
 
     def topic_ended(self, topic: str) -> None:
-        self._stream.topic_ended(self._names[topic])
+        self.step()
+        self.publish(self._stream.end([self._names[topic]]))
 
     def finish(self) -> None:
-        self._stream.finish()
+        self.step()
+        self.publish(self._stream.finish())
 
     def stop(self) -> None:
         self._relay.close()
         super().stop()
 
     def _status(self):
-        guards = self._stream.merged.guards
-        values = dict(self.summary(), held_for_merging=self._stream.merged.held,
-                      bad_messages=self._stream.bad_messages)
-        for topic, guard in guards.items():
-            values[f"{topic} taken"] = guard.counts[Verdict.OK]
-            values |= {f"{topic} {why}": count for why, count in guard.refused().items()}
-        if not any(guard.counts[Verdict.OK] for guard in guards.values()):
-            return DiagnosticStatus.WARN, "no samples yet on " + ", ".join(guards), values
-        if any(guard.refused() for guard in guards.values()) or self._stream.bad_messages:
+        stream = self._stream
+        values = dict(self.summary(), held_for_merging=stream.held)
+        refused = {topic: stream.refused(topic) for topic in stream.inputs}
+        taken = {topic: guard.counts[Verdict.OK] for topic, guard in stream.guards.items()}
+        for topic, count in taken.items():
+            values[f"{topic} taken"] = count
+            values |= {f"{topic} {why}": n for why, n in refused[topic].items()}
+        if not any(taken.values()):
+            return DiagnosticStatus.WARN, "no samples yet on " + ", ".join(taken), values
+        if any(refused.values()):
             return DiagnosticStatus.WARN, "samples were left out", values
         return DiagnosticStatus.OK, "running", values

@@ -1,8 +1,6 @@
 """The orientation estimator as a node: decode, one call, encode."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import yaml
 from builtin_interfaces.msg import Time
@@ -12,19 +10,15 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import ImuFusionError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
-from imu_fusion.nodes.base import Node, run_node
-from imu_fusion.nodes.estimator import EstimatorNode
-from imu_fusion.streams.orientation import (
-    ORIENTATION_TOPIC,
-    OUTPUTS,
-    OrientationOutputParams,
-    OrientationStream,
-    warm_up,
-)
+from imu_fusion.streams.orientation import (ORIENTATION_TOPIC, OUTPUTS,
+                                                    OrientationOutputParams, OrientationStream,
+                                                    warm_up)
 from imu_fusion.streams.stream import EstimatorNodeParams
+from imu_fusion.nodes.base import run_node
+from imu_fusion.nodes.estimator import EstimatorNode
 
 
-def transform_broadcast(node: Node) -> Callable[[TransformStamped], None]:
+def transform_broadcast(node):
     """The function that broadcasts a TransformStamped.
 
     Raises:
@@ -39,7 +33,7 @@ def transform_broadcast(node: Node) -> Callable[[TransformStamped], None]:
     return TransformBroadcaster(node).sendTransform
 
 
-def transform(cdr: bytes, fixed_frame: str) -> TransformStamped:
+def transform(cdr, fixed_frame):
     """The geometry_msgs/TransformStamped from ``fixed_frame`` to an Imu message's frame."""
     stamp, frame_id, values = IMU.decode(cdr)
     message = TransformStamped(child_frame_id=frame_id)
@@ -65,22 +59,25 @@ class OrientationEstimatorNode(EstimatorNode):
         output = self.params(OrientationOutputParams)
         self._broadcast = transform_broadcast(self) if output.publish_tf else None
         warm_up(self.params(OrientationParams))
-        self.attach(OrientationStream(
-            self.params(OrientationParams), output, self.emit,
-            self.get_logger().warning), OUTPUTS)
+        self.attach(OrientationStream(self.params(OrientationParams), output,
+                                      self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
             self.create_service(Trigger, f"~/{name}", self._answering(action))
 
-    def emit(self, topic: str, stamp: int, cdr: bytes) -> None:
-        super().emit(topic, stamp, cdr)
-        if self._broadcast is not None and topic == ORIENTATION_TOPIC:
-            self._broadcast(transform(cdr, self.params(OrientationOutputParams).fixed_frame))
+    def publish(self, made):
+        super().publish(made)
+        if self._broadcast is not None:
+            frame = self.params(OrientationOutputParams).fixed_frame
+            for part in made:
+                if part.topic == ORIENTATION_TOPIC:
+                    for cdr in part.cdrs:
+                        self._broadcast(transform(cdr, frame))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self):
         return self._stream.estimator.summary()
 
-    def apply(self, params: Mapping[type, Any]) -> None:
+    def apply(self, params):
         self._stream.change(params[OrientationParams])
 
     def _restart(self):
@@ -111,6 +108,6 @@ class OrientationEstimatorNode(EstimatorNode):
         return answer
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args=None):
     """Entry point of the executable."""
     return run_node(OrientationEstimatorNode, args)

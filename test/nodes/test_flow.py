@@ -1,4 +1,4 @@
-"""The protocol of nodes/flow.py between nodes of this process."""
+"""The protocol of nodes/flow between nodes of this process."""
 
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy

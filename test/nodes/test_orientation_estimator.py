@@ -285,8 +285,8 @@ def test_calibration_answers_as_yaml_and_is_used(graph, recording):
     graph.until(raw.get_subscription_count)
     for i in range(len(mag)):
         raw.publish(mag_message(int(mag.stamp[i]), "ball", mag.mag[i] + [1e-5, 0.0, -5e-6]))
-    guard = estimator._stream.merged.guards["imu/mag"]
-    graph.until(lambda: sum(guard.counts.values()) == len(mag))
+    graph.until(lambda: sum(
+        estimator._stream.guards["imu/mag"].counts.values()) == len(mag))
     response = graph.call(node, Trigger, "/orientation_estimator/calibrate_magnetometer")
     assert response.success, response.message
     found = yaml.safe_load(response.message)

@@ -15,8 +15,8 @@ def test_a_calibration_is_taken_over_by_every_method(values):
     stream = OrientationStream(OrientationParams.from_mapping(values))
     directions = np.random.default_rng(1).normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    for i, direction in enumerate(directions):
-        stream.take(MAG_TOPIC, i * 100_000_000, 48e-6 * direction + [1e-5, 0.0, -5e-6])
+    stamps = np.arange(len(directions), dtype=np.int64) * 100_000_000
+    stream.use({MAG_TOPIC: (stamps, 48e-6 * directions + [1e-5, 0.0, -5e-6])})
     found = stream.calibrate_magnetometer()
     params = stream.estimator.params
     assert params.sensor.mag_offset == pytest.approx([1e-5, 0.0, -5e-6], abs=1e-9)

@@ -194,15 +194,17 @@ class AccelerationFieldEstimator:
         Raises:
             SampleError: wrong shape, or a stamp that is not later than the previous one.
         """
-        readings = np.asarray(readings, dtype=float)[None]
-        gyr = None if gyr is None else np.asarray(gyr, dtype=float)[None]
-        return self._take(*self._check(np.array([stamp], dtype=np.int64), readings, gyr))
+        return self.take(np.array([stamp]), np.asarray(readings, dtype=float)[None],
+                         None if gyr is None else np.asarray(gyr, dtype=float)[None])
+
+    def take(self, stamp, readings, gyr=None):
+        """:meth:`add` of n samples: stamp (n,), readings (n, N, 3), gyr (n, 3). Returns ROWs."""
+        stamp = np.ascontiguousarray(stamp, dtype=np.int64)
+        return self._take(*self._check(stamp, np.asarray(readings, dtype=float), gyr))
 
     def run(self, stamp, readings, gyr=None):
         """Take n samples and finish: stamp (n,), readings (n, N, 3), gyr (n, 3). Returns ROWs."""
-        stamp = np.ascontiguousarray(stamp, dtype=np.int64)
-        rows = self._take(*self._check(stamp, np.asarray(readings, dtype=float), gyr))
-        return np.concatenate([rows, self.finish()])
+        return np.concatenate([self.take(stamp, readings, gyr), self.finish()])
 
     def finish(self):
         """Rows of all samples in mode smoothed, else none. Forgets the samples it smoothed.
