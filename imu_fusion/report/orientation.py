@@ -1,19 +1,23 @@
 """Sections about orientation: angles, errors against a reference, field, rates, force."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.evaluation import orientation_error
+from imu_fusion.evaluation.orientation_error import OrientationErrors
 from imu_fusion.report import figures as fig
-from imu_fusion.report.figures import Band, Line, Panel, time_figure
+from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Numbers, Section, Table, Text
 from imu_fusion.report.overview import number
-from imu_fusion.samples import seconds
+from imu_fusion.samples import AttitudeLog, ImuLog, PoseLog, seconds
 
 _MOVING = "in movement"
 
 
-def euler_zyx(quat_world_imu, cov_attitude=None):
+def euler_zyx(quat_world_imu: np.ndarray,
+              cov_attitude: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Roll, pitch, yaw (REP 103: yaw about up, then pitch about left, then roll about forward).
 
     Args:
@@ -47,7 +51,8 @@ def euler_zyx(quat_world_imu, cov_attitude=None):
     return angles, np.minimum(sd, np.pi)
 
 
-def angle_panels(estimate, origin, reference=None, reference_name="reference"):
+def angle_panels(estimate: AttitudeLog, origin: int, reference: PoseLog | None = None,
+                 reference_name: str = "reference") -> list[Panel]:
     """Panels of roll, pitch and yaw with their band, beside a reference.
 
     Args:
@@ -76,7 +81,7 @@ def angle_panels(estimate, origin, reference=None, reference_name="reference"):
     return panels
 
 
-def error_panels(errors, origin, word="error"):
+def error_panels(errors: OrientationErrors, origin: int, word: str = "error") -> list[Panel]:
     """Panels of the error rotation in world axes with the stated standard deviations.
 
     Args:
@@ -95,7 +100,8 @@ def error_panels(errors, origin, word="error"):
     return panels
 
 
-def orientation_section(estimate, origin, reference=None, reference_name="reference", shades=()):
+def orientation_section(estimate: AttitudeLog, origin: int, reference: PoseLog | None = None,
+                        reference_name: str = "reference", shades: Sequence[Shade] = ()) -> Section:
     """Section with roll, pitch and yaw of an estimate beside a reference.
 
     Args:
@@ -120,8 +126,9 @@ def orientation_section(estimate, origin, reference=None, reference_name="refere
                "errors are judged below without angles that can do that."),))
 
 
-def error_section(errors, origin, moving=None, reference_name="reference", is_truth=True,
-                  shades=()):
+def error_section(errors: OrientationErrors, origin: int, moving: np.ndarray | None = None,
+                  reference_name: str = "reference", is_truth: bool = True,
+                  shades: Sequence[Shade] = ()) -> Section:
     """Section with the errors against a reference and their statistics.
 
     Args:
@@ -188,7 +195,8 @@ def _honesty(errors, moving):
                   f"{nees.mean():.2f}; 3 would be expected.")]
 
 
-def field_section(stamp, mag_world, origin, shades=()):
+def field_section(stamp: np.ndarray, mag_world: np.ndarray, origin: int,
+                  shades: Sequence[Shade] = ()) -> Section:
     """Section with the magnetic field carried into the world by the estimate.
 
     Args:
@@ -221,7 +229,8 @@ def field_section(stamp, mag_world, origin, shades=()):
                "steers by the field keeps them still.")))
 
 
-def motion_section(raw, corrected, origin, shades=()):
+def motion_section(raw: ImuLog, corrected: AttitudeLog, origin: int,
+                   shades: Sequence[Shade] = ()) -> Section:
     """Section with angular rates and specific force.
 
     Args:
@@ -248,7 +257,9 @@ def motion_section(raw, corrected, origin, shades=()):
         Figure(time_figure(panels, shades), " ".join(caption)),))
 
 
-def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0, is_truth=True):
+def key_numbers(duration_s: float, imu_rate_hz: float, errors: OrientationErrors | None = None,
+                moving: np.ndarray | None = None, findings: int = 0,
+                is_truth: bool = True) -> Numbers:
     """The numbers at the top of a report."""
     items = [Number("Duration", f"{duration_s:.1f} s"),
              Number("Imu", f"{number(imu_rate_hz, 1)} Hz", "mean rate")]
