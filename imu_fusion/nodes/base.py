@@ -117,7 +117,8 @@ class Node(rclpy.node.Node):
             level, message, values = status()
             array = DiagnosticArray(status=[DiagnosticStatus(
                 level=level, name=f"{self.get_fully_qualified_name().lstrip('/')}: {task}",
-                message=message, hardware_id="imu_fusion", values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
+                message=message, hardware_id="imu_fusion",
+                values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
             array.header.stamp = self.get_clock().now().to_msg()
             publisher.publish(array)
 

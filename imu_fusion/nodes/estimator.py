@@ -34,7 +34,7 @@ class EstimatorNode(Node):
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()
         self._names = {}  # resolved name -> ours
-        self._waiting: dict[str, list[bytes]] = {}  # topic -> messages that have come since the last step
+        self._waiting: dict[str, list[bytes]] = {}  # by topic, since the last step
         for topic, kind in stream.inputs.items():
             inbox = self._relay.subscribe(message_class(kind.layout.msgtype), topic,
                                           lambda cdr, _, topic=topic: self._waiting.setdefault(

@@ -13,14 +13,20 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.kernels import announced_compiling
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother.result import SAMPLE
-from imu_fusion.streams import smoother as smoothing
-from imu_fusion.streams.smoother import (INPUTS, OUTPUTS, PER_SAMPLE, SmootherStream,
-                                           SmootherNodeParams, SmoothingParams)
+from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import FlowSink, FlowSource, reliable_qos, sensor_qos
+from imu_fusion.streams import smoother as smoothing
+from imu_fusion.streams.smoother import (
+    INPUTS,
+    OUTPUTS,
+    PER_SAMPLE,
+    SmootherNodeParams,
+    SmootherStream,
+    SmoothingParams,
+)
 from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
 

@@ -1,6 +1,7 @@
 """Sections about orientation: angles, errors against a reference, field, rates, force."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,7 @@ _MOVING = "in movement"
 
 
 def euler_zyx(quat_world_imu: np.ndarray,
-              cov_attitude: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+              cov_attitude: np.ndarray | None = None) -> tuple[np.ndarray, Any]:
     """Roll, pitch, yaw (REP 103: yaw about up, then pitch about left, then roll about forward).
 
     Args:
@@ -63,8 +64,9 @@ def angle_panels(estimate: AttitudeLog, origin: int, reference: PoseLog | None =
     time = seconds(estimate.stamp, origin)
     angles, sd = (np.degrees(a) for a in euler_zyx(estimate.quat_world_imu,
                                                    estimate.cov_attitude))
-    has_reference = reference is not None and len(reference) > 0
-    if has_reference:
+    has_reference = False
+    if reference is not None and len(reference):
+        has_reference = True
         known = np.isfinite(reference.quat_world_imu).all(axis=1)
         ref_time = seconds(reference.stamp[known], origin)
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
@@ -143,16 +145,16 @@ def error_section(errors: OrientationErrors, origin: int, moving: np.ndarray | N
     for label, mask in ((_MOVING, moving), ("all samples", None)):
         if label == _MOVING and moving is None:
             continue
-        for row in orientation_error.statistics(errors, mask):
-            rows.append((label, row.name, number(row.rmse_deg, 2), number(row.median_deg, 2),
-                         number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count))
+        rows += [(label, row.name, number(row.rmse_deg, 2), number(row.median_deg, 2),
+                  number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count)
+                 for row in orientation_error.statistics(errors, mask)]
     table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
                   f"{word.capitalize()}s relative to {reference_name}. The {word} rotation "
-                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig et "
-                  "al. 2021) into a heading part about the vertical and an inclination part about a "
-                  "horizontal axis.")
-    blocks = [table]
+                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig "
+                  "et al. 2021) into a heading part about the vertical and an inclination part "
+                  "about a horizontal axis.")
+    blocks: list[Any] = [table]
     if is_truth:
         blocks += _honesty(errors, moving)
     panels = error_panels(errors, origin, word)
@@ -266,9 +268,9 @@ def key_numbers(duration_s: float, imu_rate_hz: float, errors: OrientationErrors
     if errors is not None:
         where = "moving" if moving is not None else "all samples"
         word = "error" if is_truth else "difference"
-        for row in orientation_error.statistics(errors, moving):
-            items.append(Number(f"{row.name.capitalize()} {word}", f"{number(row.rmse_deg, 2)}°",
-                                f"RMS, {where}"))
+        items += [Number(f"{row.name.capitalize()} {word}", f"{number(row.rmse_deg, 2)}°",
+                         f"RMS, {where}")
+                  for row in orientation_error.statistics(errors, moving)]
         shares = orientation_error.shares_within(errors, moving) if is_truth else {}
         for name, values in shares.items():
             if np.isfinite(values[0]):

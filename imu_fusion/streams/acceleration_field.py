@@ -78,7 +78,7 @@ def _gyr_values(values):
 
 ACCELEROMETER = SampleType(IMU, 3, _acc_values, AccelerometerLog)
 GYROSCOPE = SampleType(IMU, 3, _gyr_values,
-                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, None, frame))
+                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, frame_id=frame))
 
 
 @dataclass(frozen=True)
@@ -167,13 +167,13 @@ class AccelerationFieldStream(Stream):
         super().__init__(config.inputs, warn)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
-        self._impacts = []
+        self._impacts: list[dict[str, Any]] = []
         super().reset(session_topics)
 
     def restart(self) -> None:
         self.estimator.reset()
         self.matcher = self.config.make_matcher()
-        self._rows = []
+        self._rows: list[np.ndarray] = []
         self.saturated = self.missing = 0
         self.residual_rms = float("nan")
 

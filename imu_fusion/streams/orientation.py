@@ -70,7 +70,7 @@ class OrientationOutputParams(Parameters):
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
     publish_tf: bool = param(False, doc="Also broadcast the orientation as the transform from "
-                                        "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
+                             "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
 
 
@@ -234,7 +234,7 @@ class OrientationStream(Stream):
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator = MagCalibrator()
-        self._next_calibration = None
+        self._next_calibration: int | None = None
         super().__init__(INPUTS, warn)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
@@ -246,7 +246,7 @@ class OrientationStream(Stream):
         self._writer.restart()
         self._knows_north = False
         self._has_force = False
-        self._kept = []
+        self._kept: list[tuple[Samples, Samples]] = []
 
     def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         imu = samples.get(IMU_TOPIC, _NO_IMU)
@@ -257,7 +257,7 @@ class OrientationStream(Stream):
             return []
         # What is published from the first fix on refers to true north.
         stamp, turn = self._first_north(*samples.get(FIX_TOPIC, _NO_FIX))
-        made = []
+        made: list[Messages] = []
         if stamp is not None:
             before = [np.searchsorted(stamps, stamp) for stamps, _ in (imu, mag)]
             made = self._run(*((s[:k], v[:k]) for (s, v), k in zip((imu, mag), before)))
@@ -266,7 +266,7 @@ class OrientationStream(Stream):
         return made + self._run(imu, mag)
 
     def flush(self) -> list[Messages]:
-        made = []
+        made: list[Messages] = []
         if self._kept:
             imu, mag = (joined(parts) for parts in zip(*self._kept))
             self._kept = []

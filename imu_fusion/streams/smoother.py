@@ -194,9 +194,10 @@ class Outcome:
     @classmethod
     def of(cls, result: SmootherResult, frame_id: str) -> Self:
         """Of a SmootherResult."""
-        numbers = {"samples": len(result.samples), "iterations": result.iterations,
-                   "converged": result.converged, "cost": float(result.cost[-1]),
-                   "misfit": result.misfit()}
+        numbers: dict[str, Any] = {
+            "samples": len(result.samples), "iterations": result.iterations,
+            "converged": result.converged, "cost": float(result.cost[-1]),
+            "misfit": result.misfit()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()
