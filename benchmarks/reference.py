@@ -12,8 +12,7 @@ from pathlib import Path
 import imu_fusion
 from benchmarks import architecture
 from benchmarks.readme import fill
-from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.params import AccelerometerParams
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.base import Node
 from imu_fusion.parameters.declare import fields_of, is_group, markdown_table
@@ -22,8 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 WRITTEN_BY = "<!-- written by python -m benchmarks.reference -->\n"
 # Parameters of single sensors, of which there may be any number: prefix to class.
-PER_SENSOR = {"acceleration_field_estimator": {"accelerometers.<name>.": AccelerometerParams,
-                                               "gyroscope.": GyroscopeParams}}
+PER_SENSOR = {"acceleration_field_estimator": {"accelerometers.<name>.": AccelerometerParams}}
 
 
 def node_class(name):

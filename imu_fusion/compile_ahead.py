@@ -65,12 +65,12 @@ def _acceleration_field() -> None:
     places = {"a": [0.1, 0.0, 0.0], "b": [0.0, 0.1, 0.0], "c": [0.0, 0.0, 0.1],
               "d": [-0.1, -0.1, 0.0]}
     readings = np.repeat(imu.acc[:, None], len(places), axis=1)
-    layout = {"sample_rate": 100.0, "accelerometers.names": list(places), "points": [0.0] * 3,
-              **{f"accelerometers.{name}.position": place for name, place in places.items()}}
+    array = {"sample_rate": 100.0, "accelerometers.names": list(places), "points": [0.0] * 3,
+             **{f"accelerometers.{name}.position": place for name, place in places.items()}}
     for values, gyr in (({}, None), ({"mode": "smoothed"}, None), ({"method": "ao"}, None),
                         ({"method": "sqrt_ao"}, None),
-                        ({"gyroscope.noise_density": 1e-3}, imu.gyr)):
-        config = FieldConfiguration.from_mapping(layout | values)
+                        ({"use_gyro": True}, imu.gyr)):
+        config = FieldConfiguration.from_mapping(array | values)
         estimator = config.make_estimator()
         estimator.run(imu.stamp, readings, gyr)
         if values.get("mode") != "smoothed":

@@ -2,12 +2,10 @@
 
 from std_srvs.srv import Trigger
 
-from imu_fusion.streams.acceleration_field import (NODE, NODE_PARAMETERS, OUTPUTS,
-                                                           SENSOR_PREFIXES,
-                                                           AccelerationFieldStream,
-                                                           FieldConfiguration)
 from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
+from imu_fusion.streams.acceleration_field import (
+    NODE, NODE_PARAMETERS, OUTPUTS, SENSOR_PREFIXES, AccelerationFieldStream, FieldConfiguration)
 
 
 class AccelerationFieldEstimatorNode(EstimatorNode):

@@ -40,7 +40,7 @@ class EstimatorNode(Node):
                                           lambda cdr, _, topic=topic: self._waiting.setdefault(
                                               topic, []).append(cdr), qos)
             self._names[inbox.topic] = topic
-        self.start_diagnostics(self._status)
+        self.start_diagnostics("samples", self._status)
 
     def publish(self, made: Sequence[Messages]) -> None:
         """Publish what the stream has made: a list of Messages."""

@@ -84,7 +84,7 @@ class Recorder(Node):
         self._flow = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end,
                               hold=lambda: self._sim_time and not self._now())
         steady_timer(self, 0.2, self._discover)
-        self.start_diagnostics(lambda: (b"\0", "recording", dict(self._writer.counts)))
+        self.start_diagnostics("recording", lambda: (b"\0", "recording", dict(self._writer.counts)))
 
     def close(self) -> None:
         """Close the recording and say what is in it."""

@@ -125,7 +125,7 @@ class SmootherNode(Node):
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
         self.create_service(Trigger, "~/clear", self._on_clear)
-        self.start_diagnostics(self._status)
+        self.start_diagnostics("collection", self._status)
 
     def work(self):
         """See :meth:`Node.work`."""

@@ -1,17 +1,20 @@
 """The acceleration field estimator between its topics, live and in batch."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.acceleration_field.estimator import (
-    AccelerationFieldEstimator,
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
+from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
-    GyroscopeParams,
+    AccelerometerParams,
     parse_configuration,
 )
-from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
 from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED, field_at
 from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.messages.convert import SampleType, imu_messages
@@ -31,19 +34,37 @@ ACCEL_TOPIC = "acceleration_field/accel"
 POINTS_TOPIC = "acceleration_field/points"
 OUTPUTS = {IMU_TOPIC: IMU.msgtype, ACCEL_TOPIC: ACCEL.msgtype, POINTS_TOPIC: POINT_CLOUD_TYPE}
 # Names below these belong to single sensors, however many there are.
-SENSOR_PREFIXES = ("accelerometers.", "gyroscope.")
+SENSOR_PREFIXES = ("accelerometers.",)
 _FIELDS = ("x", "y", "z", "ax", "ay", "az", "magnitude")
 
 
 @dataclass(frozen=True)
-class MatchingParams(Parameters):
-    """How samples of several accelerometers become one, and how the body is called."""
+class MatchParams(Parameters):
+    """``match.*``: how samples of several accelerometers become one."""
 
-    match__tolerance: float = param(
-        1e-4, unit="s", low=0, doc="Stamps that differ by no more belong to one sample.")
-    match__hold: float = param(
-        0.02, unit="s", low=0, doc="A sample waits no longer for a missing accelerometer.")
-    body_frame: str = param("body", doc="frame_id of the body in everything published.")
+    tolerance: float = param(
+        1e-4, unit="s", low=0.0,
+        doc="Stamps that differ by no more belong to one sample. Raise it for clocks that are not "
+            "synchronised, to less than half a sample interval.")
+    hold: float = param(
+        0.02, unit="s", low=0.0,
+        doc="A sample waits no longer, in stamps of the others, for a missing accelerometer. Raise "
+            "it for late networks.")
+
+
+@dataclass(frozen=True)
+class FieldStreamParams(Parameters):
+    """What surrounds the estimator."""
+
+    body_frame: str = param(
+        "body", doc="frame_id of the body in everything published. Name it as your robot does.")
+    match: MatchParams = MatchParams()
+    impact: ImpactParams = ImpactParams()
+
+    def idle(self) -> dict[str, str]:
+        return {} if self.impact.detect else {
+            f"impact.{info.name}": "with impact.detect false" for info in ImpactParams.infos()
+            if info.name != "detect"}
 
 
 def _acc_values(values):
@@ -61,54 +82,55 @@ GYROSCOPE = SampleType(IMU, 3, _gyr_values,
 
 @dataclass(frozen=True)
 class FieldConfiguration:
-    """Parameters of the estimator and of all its sensors; ``inputs`` maps topics to SampleType."""
+    """Parameters of the estimator, its accelerometers by name, and what surrounds it."""
 
     field: AccelerationFieldParams
-    matching: MatchingParams
-    impact: ImpactParams
-    accelerometers: dict
-    gyroscope: GyroscopeParams | None
+    stream: FieldStreamParams
+    accelerometers: dict[str, AccelerometerParams]
 
     @classmethod
-    def from_mapping(cls, values, source=""):
+    def from_mapping(cls, values: Mapping[str, Any], source: str = "") -> "FieldConfiguration":
         """From ROS parameter names and values, without those of the node itself.
 
         Raises:
             ParameterError, LayoutError: with the name of what is wrong.
         """
         flat = flatten(values)
-        matching, impact = (
-            c.from_mapping({i.name: flat.pop(i.name) for i in c.infos() if i.name in flat}, source)
-            for c in (MatchingParams, ImpactParams))
-        field, accelerometers, gyroscope = parse_configuration(flat, source)
-        return cls(field, matching, impact, accelerometers, gyroscope)
+        own = {info.name for info in FieldStreamParams.infos()}
+        stream = FieldStreamParams.from_mapping({k: v for k, v in flat.items() if k in own}, source)
+        field, accelerometers = parse_configuration(
+            {k: v for k, v in flat.items() if k not in own}, source)
+        return cls(field, stream, accelerometers)
 
     @staticmethod
-    def names():
+    def names() -> set[str]:
         """Parameter names, without those of single sensors."""
         return {info.name for cls in NODE_PARAMETERS for info in cls.infos()}
 
     @property
-    def inputs(self):
+    def inputs(self) -> dict[str, SampleType]:
+        """Topics and what arrives on them."""
         inputs = {f"accelerometers/{name}": ACCELEROMETER for name in self.accelerometers}
-        if self.gyroscope is not None:
+        if self.field.use_gyro:
             inputs[GYROSCOPE_TOPIC] = GYROSCOPE
         return inputs
 
-    def make_estimator(self):
-        return AccelerationFieldEstimator(self.field, self.accelerometers, self.gyroscope)
+    def make_estimator(self) -> AccelerationFieldEstimator:
+        """The estimator of these parameters."""
+        return AccelerationFieldEstimator(self.field, self.accelerometers)
 
-    def make_matcher(self):
-        return SampleMatcher(len(self.inputs), 3, int(round(self.matching.match__tolerance * 1e9)),
-                             int(round(self.matching.match__hold * 1e9)))
+    def make_matcher(self) -> SampleMatcher:
+        """What makes one sample of those of all inputs."""
+        match = self.stream.match
+        return SampleMatcher(len(self.inputs), 3, int(round(match.tolerance * 1e9)),
+                             int(round(match.hold * 1e9)))
 
 
-
-def messages(config, rows):
+def messages(config: FieldConfiguration, rows: np.ndarray) -> list[Messages]:
     """Messages of rows of the estimator."""
     if not len(rows):
         return []
-    gravity, frame = config.field.gravity, config.matching.body_frame
+    gravity, frame = config.field.gravity, config.stream.body_frame
     stamp = np.ascontiguousarray(rows["stamp"])
     turn = rotation_matrices(rows["quat"])
     back = turn.transpose(0, 2, 1)
@@ -175,10 +197,12 @@ class AccelerationFieldStream(Stream):
 
     def conclude(self):
         """The metrics of impacts, where there are any."""
+        if not self.config.stream.impact.detect:
+            return Conclusion()
         number = len({impact["stamp"] for impact in self._impacts})
         return Conclusion(
             results={"impacts": self._impacts} if self._impacts else {},
-            summary=f"{number} impacts above {self.config.impact.impact__trigger:g} m/s^2")
+            summary=f"{number} impacts above {self.config.stream.impact.trigger:g} m/s^2")
 
     def summary(self):
         """Values for diagnostics."""
@@ -192,7 +216,7 @@ class AccelerationFieldStream(Stream):
         if not len(stamp):
             return []
         count = len(self.config.accelerometers)
-        gyr = readings[:, count] if self.config.gyroscope is not None else None
+        gyr = readings[:, count] if self.config.field.use_gyro else None
         return self._write(self.estimator.take(stamp, readings[:, :count], gyr))
 
     def _write(self, rows):
@@ -207,19 +231,20 @@ class AccelerationFieldStream(Stream):
 
 
 def _impacts(config, rows):
-    return measure_impacts(rows, config.field.points, config.field.gravity, config.impact)
+    return measure_impacts(rows, config.field.points, config.field.gravity, config.stream.impact)
 
 
-NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, MatchingParams, ImpactParams)
+NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, FieldStreamParams)
 
 
-def read_configuration(params_file):
+def read_configuration(params_file: str | Path | None) -> FieldConfiguration:
     """The FieldConfiguration in a parameter file (or None).
 
     Raises:
         ParameterError, LayoutError: with the name of what is wrong.
     """
-    values = node_values(NODE, params_file, FieldConfiguration.names())
+    old = AccelerationFieldParams.OLD_NAMES.keys()
+    values = node_values(NODE, params_file, FieldConfiguration.names() | old)
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
     return FieldConfiguration.from_mapping(values, str(params_file or ""))

@@ -194,7 +194,7 @@ def test_diagnostics_say_what_was_left_out(graph, recording):
 
     def told():
         return any({v.key: v.value for v in s.values}.get("imu/data_raw repeated stamp") == "1"
-                   for s in said if s.name == "orientation_estimator")
+                   for s in said if s.name == "orientation_estimator: samples")
     graph.until(told)
 
 
