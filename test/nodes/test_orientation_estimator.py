@@ -15,15 +15,15 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import ParameterError
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, MAG, VECTOR3
 from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value
-from imu_fusion.streams.orientation import OUTPUTS as TYPES
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode, transform
 from imu_fusion.nodes.replayer import Replayer
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.streams.orientation import OUTPUTS as TYPES
 from test.nodes.conftest import START, STEP, collector
 
 OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool,
@@ -155,7 +155,7 @@ def test_live_answers_every_imu_without_waiting_for_the_magnetometer(graph, reco
     node.create_publisher(MagneticField, "/imu/mag", 1000)  # says nothing
     graph.start(OrientationEstimatorNode)
     heard = []
-    node.create_subscription(Imu, "/imu/data", lambda m: heard.append(m), 1000)
+    node.create_subscription(Imu, "/imu/data", heard.append, 1000)
     graph.until(lambda: raw.get_subscription_count() == 1)
     for i in range(500):
         raw.publish(imu_message(int(imu.stamp[i]), "ball", imu.gyr[i], imu.acc[i]))
@@ -282,7 +282,7 @@ def test_calibration_answers_as_yaml_and_is_used(graph, recording):
     node = graph.node("driver")
     raw = node.create_publisher(MagneticField, "/imu/mag", 5000)
     estimator = graph.start(OrientationEstimatorNode)
-    graph.until(lambda: raw.get_subscription_count())
+    graph.until(raw.get_subscription_count)
     for i in range(len(mag)):
         raw.publish(mag_message(int(mag.stamp[i]), "ball", mag.mag[i] + [1e-5, 0.0, -5e-6]))
     graph.until(lambda: sum(
