@@ -4,8 +4,8 @@ from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.kernels import njit
 
 NAME = "back in range"
-# rad/s. Small beside what is known of the clipped rate before: with the default angular_acc_sd, 2 rad/s
-# after 10 ms.
+# rad/s. Small beside what is known of the clipped rate before: with the default angular_acc_sd,
+# 2 rad/s after 10 ms.
 _BACK_SD = 0.1
 
 
