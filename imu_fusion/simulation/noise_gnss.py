@@ -29,7 +29,8 @@ class GnssErrors(Parameters):
     time_offset: float = param(0.0, doc="The receiver's stamps are late by this", unit="s")
 
 
-def gauss_markov(times: np.ndarray, sd: ArrayLike, tau: float, rng: np.random.Generator) -> np.ndarray:
+def gauss_markov(times: np.ndarray, sd: ArrayLike, tau: float,
+                 rng: np.random.Generator) -> np.ndarray:
     """Samples (n, k) of first-order Gauss-Markov errors at times (n,) s: stationary standard
     deviation sd (k,), correlation exp(-dt/tau)."""
     each = np.asarray(sd, dtype=float)

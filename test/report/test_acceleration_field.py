@@ -65,7 +65,8 @@ def recording(tmp_path_factory):
                for name, place in PLACES.items()}
     sensors["b"]["axes"] = AXES_B.ravel().tolist()
     parameters = {"accelerometers": {"names": list(PLACES), **sensors},
-                  "use_gyro": True, "sensor": {"gyro_range": [LIMIT]}, "points": list(POINT), "sample_rate": 1000.0}
+                  "use_gyro": True, "sensor": {"gyro_range": [LIMIT]}, "points": list(POINT),
+                   "sample_rate": 1000.0}
     (folder / "p.yaml").write_text(yaml.safe_dump(
         {"acceleration_field_estimator": {"ros__parameters": parameters}}))
     return folder / "bag", folder / "p.yaml"
