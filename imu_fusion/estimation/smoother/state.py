@@ -76,6 +76,7 @@ class Block:
         """Number of error states."""
         return len(self.components)
 
+
 #: All optional blocks, in their order in the state. Magnetic ones are kept in microtesla, near one
 #: in size.
 BLOCKS = (

@@ -83,6 +83,7 @@ def predict(x, tau, step, model, rows):
             for j in range(3):
                 h[i, blocks.gnss_lever_arm + j] += rotation[i, j]
 
+
 MEASUREMENT = Measurement(
     "fix", "position", ("east", "north", "up"), prepare,
     "the covariances of the messages (gnss.covariances: false) or gnss.fix_sd may be too small, "

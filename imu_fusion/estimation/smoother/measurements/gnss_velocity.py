@@ -59,6 +59,7 @@ def predict(x, tau, step, model, rows):
     if blocks.gnss_lever_arm >= 0:
         put_cross_matrix(rotation, rate, 1.0, h, blocks.gnss_lever_arm)
 
+
 MEASUREMENT = Measurement(
     "velocity", "velocity", ("east", "north", "up"), prepare,
     "the covariances of the messages (gnss.covariances: false) or gnss.velocity_sd may be "

@@ -67,6 +67,7 @@ def _field(rotation, field_world):
             rotation[0, 2] * field_world[0] + rotation[1, 2] * field_world[1]
             + rotation[2, 2] * field_world[2])
 
+
 MEASUREMENT = Measurement(
     "mag", "magnetic field", ("x", "y", "z"), prepare,
     "the field may be disturbed, or sensor.mag_noise_sd, mag_bias_sd and mag_scale_sd too small")
