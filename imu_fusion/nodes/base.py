@@ -105,6 +105,11 @@ class Node(rclpy.node.Node):
         """Asked to end (signal): do what is needed until ``finished`` is true."""
         self.finished = True
 
+    @property
+    def exit_code(self) -> int:
+        """With what the process ends: 1 if something happened that the user must know of."""
+        return 0
+
     def close(self):
         """Release files; called once, whatever happened."""
 
@@ -218,8 +223,7 @@ def run_node(node_class, args=None):
         use_fast_heartbeats()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
-        _run(node_class, signals, files)
-        return 0
+        return _run(node_class, signals, files)
     except KeyboardInterrupt:
         return 0
     except ImuFusionError as error:
@@ -261,6 +265,7 @@ def _run(node_class, signals, params_files):
         finally:
             executor.shutdown()
             node.destroy_node()
+    return node.exit_code
 
 
 def usage(node_class):
