@@ -235,7 +235,7 @@ def convert(source, out, topics, description, remap, overwrite):
         renamed = {reader.require(other).name: name for other, name in names.items()}
         with (BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer,
               click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
-                                length=sum(reader.topics[t].count for t in kept),
+                                length=sum(reader.topics[t].count or 0 for t in kept),
                                 file=sys.stderr) as messages):
             for topic, msgtype, log_time, cdr in messages:
                 writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,

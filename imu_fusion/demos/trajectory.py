@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from imu_fusion.errors import EstimationError
 from imu_fusion.nodes.pipeline import run_pipeline
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
@@ -25,6 +26,8 @@ def replay_and_smooth(bag: Path, out: Path, params_file: Path, console: Console)
         duration = (read_log(reader, "imu/data_raw").stamp[[0, -1]] * [-1, 1]).sum() * 1e-9
         recorded = read_log(reader, SMOOTHED_FIX_TOPIC)
     smoothed = write_recording_report(bag, None, report, params_file)
+    if smoothed is None:
+        raise EstimationError(f"{bag}: the nodes have smoothed it, the report has not")
     samples, frame = smoothed.result.samples, smoothed.result.frame
     latitude, longitude, height = frame.to_geodetic(samples["position_world"])
     same = (np.array_equal(recorded.stamp, samples["stamp"])

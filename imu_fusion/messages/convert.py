@@ -9,16 +9,18 @@ estimators keep it about the axes of the sensor.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
 from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
 from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
 from imu_fusion.samples import AttitudeLog, FixLog, ImuLog, MagLog, PoseLog, VelocityLog
+from imu_fusion.samples.logs import Log
 
 UNKNOWN = np.zeros((3, 3))
 ABSENT = np.zeros((3, 3))
@@ -26,8 +28,9 @@ ABSENT[0, 0] = -1.0
 _COVARIANCE_KNOWN = 3
 
 
-def imu_message(stamp, frame_id, gyr, acc, quat=None, cov_orientation=UNKNOWN, cov_gyr=UNKNOWN,
-                cov_acc=UNKNOWN):
+def imu_message(stamp: int, frame_id: str, gyr: ArrayLike | None, acc: ArrayLike | None,
+                quat: ArrayLike | None = None, cov_orientation: ArrayLike = UNKNOWN,
+                cov_gyr: ArrayLike = UNKNOWN, cov_acc: ArrayLike = UNKNOWN) -> bytes:
     """CDR bytes of a sensor_msgs/Imu.
 
     Args:
@@ -50,21 +53,22 @@ def imu_message(stamp, frame_id, gyr, acc, quat=None, cov_orientation=UNKNOWN, c
     return IMU.encode(stamp, frame_id, values)
 
 
-def mag_message(stamp, frame_id, mag, cov=UNKNOWN):
+def mag_message(stamp: int, frame_id: str, mag: ArrayLike, cov: ArrayLike = UNKNOWN) -> bytes:
     """CDR bytes of a sensor_msgs/MagneticField. mag: (3,) tesla, cov: (3, 3) tesla^2."""
     return MAG.encode(stamp, frame_id, np.concatenate([np.asarray(mag, float), np.reshape(cov, 9)]))
 
 
-def fix_message(stamp, frame_id, latitude_deg, longitude_deg, height, cov_enu=None, status=0,
-                service=1):
+def fix_message(stamp: int, frame_id: str, latitude_deg: float, longitude_deg: float,
+                height: float, cov_enu: ArrayLike | None = None, status: int = 0,
+                service: int = 1) -> bytes:
     """CDR bytes of a sensor_msgs/NavSatFix. height: ellipsoidal m, cov_enu: (3, 3) m^2 or None."""
-    known = cov_enu is not None
-    cov = np.reshape(cov_enu, 9) if known else np.zeros(9)
+    cov = np.zeros(9) if cov_enu is None else np.reshape(cov_enu, 9)
     return FIX.encode(stamp, frame_id, [status, service, latitude_deg, longitude_deg, height, *cov,
-                                        _COVARIANCE_KNOWN if known else 0])
+                                        0 if cov_enu is None else _COVARIANCE_KNOWN])
 
 
-def velocity_message(stamp, frame_id, vel_world, cov_world=None):
+def velocity_message(stamp: int, frame_id: str, vel_world: ArrayLike,
+                     cov_world: ArrayLike | None = None) -> bytes:
     """CDR bytes of a geometry_msgs/TwistWithCovarianceStamped. vel_world: (3,) m/s ENU."""
     cov = np.zeros((6, 6))
     if cov_world is not None:
@@ -74,12 +78,13 @@ def velocity_message(stamp, frame_id, vel_world, cov_world=None):
                         np.concatenate([np.asarray(vel_world, float), np.zeros(3), cov.ravel()]))
 
 
-def pose_message(stamp, frame_id, quat_world_imu, position_world=(0.0, 0.0, 0.0)):
+def pose_message(stamp: int, frame_id: str, quat_world_imu: Sequence[float] | np.ndarray,
+                 position_world: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> bytes:
     """CDR bytes of a geometry_msgs/PoseStamped."""
     return POSE.encode(stamp, frame_id, [*position_world, *quat_world_imu])
 
 
-def orientation_message(row, frame_id, has_force=True):
+def orientation_message(row: np.void, frame_id: str, has_force: bool = True) -> bytes:
     """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator.
 
     ``has_force``: whether the sensor measures specific force; if not it is absent.
@@ -90,34 +95,34 @@ def orientation_message(row, frame_id, has_force=True):
                        rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
 
 
-def rpy_message(row, frame_id):
+def rpy_message(row: np.void, frame_id: str) -> bytes:
     """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of one row."""
     return VECTOR3.encode(row["stamp"], frame_id, quat_to_rpy(row["quat_world_imu"]))
 
 
-def bool_message(value):
+def bool_message(value: bool) -> bytes:
     """CDR bytes of a std_msgs/Bool."""
     return b"\x00\x01\x00\x00\x01" if value else b"\x00\x01\x00\x00\x00"
 
 
-def bool_value(cdr):
+def bool_value(cdr: bytes) -> bool:
     """The value of a CDR std_msgs/Bool."""
     return cdr[4] == 1
 
 
-def string_message(text):
+def string_message(text: str) -> bytes:
     """CDR bytes of a std_msgs/String."""
     data = text.encode() + b"\0"
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(data)) + data
 
 
-def string_value(cdr):
+def string_value(cdr: bytes) -> str:
     """The text of a CDR std_msgs/String."""
     (length,) = struct.unpack_from("<I" if cdr[1] else ">I", cdr, 4)
     return bytes(cdr[8:8 + length - 1]).decode()
 
 
-def imu_values(values):
+def imu_values(values: np.ndarray) -> np.ndarray:
     """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
     result = np.concatenate([values[..., IMU["angular_velocity"]],
                              values[..., IMU["linear_acceleration"]]], axis=-1)
@@ -127,7 +132,7 @@ def imu_values(values):
     return result
 
 
-def gyroscope_first_values(values):
+def gyroscope_first_values(values: np.ndarray) -> np.ndarray:
     """As imu_values, but specific force is zero where absent: a gyroscope alone is enough."""
     result = imu_values(values)
     absent = values[..., IMU["linear_acceleration_covariance"].start] == -1.0
@@ -135,12 +140,12 @@ def gyroscope_first_values(values):
     return result
 
 
-def mag_values(values):
+def mag_values(values: np.ndarray) -> np.ndarray:
     """Field (..., 3) of decoded sensor_msgs/MagneticField values."""
     return values[..., MAG["magnetic_field"]]
 
 
-def fix_values(values):
+def fix_values(values: np.ndarray) -> np.ndarray:
     """Latitude, longitude, height, covariance row by row, status (..., 13) of NavSatFix values.
 
     A covariance whose type is unknown becomes zeros, whatever the message has in it."""
@@ -149,14 +154,14 @@ def fix_values(values):
     return np.concatenate([values[..., 2:5], cov, values[..., :1]], axis=-1)
 
 
-def velocity_values(values):
+def velocity_values(values: np.ndarray) -> np.ndarray:
     """Velocity, covariance row by row (..., 12) of TwistWithCovarianceStamped values."""
     cov = values[..., TWIST["covariance"]].reshape(*values.shape[:-1], 6, 6)[..., :3, :3]
     return np.concatenate([values[..., TWIST["linear"]], cov.reshape(*values.shape[:-1], 9)],
                           axis=-1)
 
 
-def pose_values(values):
+def pose_values(values: np.ndarray) -> np.ndarray:
     """Orientation, position (..., 7) of PoseStamped values."""
     return np.concatenate([values[..., POSE["orientation"]], values[..., POSE["position"]]],
                           axis=-1)
@@ -190,10 +195,10 @@ class SampleType:
 
     layout: Layout
     width: int
-    values: Callable
-    log: Callable
+    values: Callable[[np.ndarray], np.ndarray]
+    log: Callable[[np.ndarray, np.ndarray, str], Log]
 
-    def read(self, messages):
+    def read(self, messages: Sequence[bytes]) -> Log:
         """The log of a list of CDR messages, in the order given; the frame of the first."""
         stamp, frames, values = self.layout.decode_many(messages)
         return self.log(stamp, self.values(values), frames[0] if frames else "")
@@ -210,7 +215,7 @@ GYROSCOPE_FIRST = replace(SAMPLE_TYPES[IMU.msgtype], values=gyroscope_first_valu
 """The SampleType of estimators that can do without specific force."""
 
 
-def attitude_log(messages):
+def attitude_log(messages: Sequence[bytes]) -> AttitudeLog:
     """AttitudeLog of a list of CDR sensor_msgs/Imu with orientation, such as imu/data.
 
     Raises:

@@ -1,5 +1,8 @@
 """A diagnostic_msgs/DiagnosticArray with one status: stamped words and values."""
 
+from collections.abc import Mapping
+from typing import cast
+
 from rosbags.typesys.stores.ros2_jazzy import builtin_interfaces__msg__Time as Time
 from rosbags.typesys.stores.ros2_jazzy import (
     diagnostic_msgs__msg__DiagnosticArray as DiagnosticArray,
@@ -17,7 +20,9 @@ from imu_fusion.messages.typestore import TYPES
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
 
-def diagnostics_message(stamp, frame_id, name, words, values, worries=False, hardware_id=""):
+def diagnostics_message(stamp: int, frame_id: str, name: str, words: str,
+                        values: Mapping[str, str], worries: bool = False,
+                        hardware_id: str = "") -> bytes:
     """CDR bytes.
 
     Args:
@@ -32,14 +37,14 @@ def diagnostics_message(stamp, frame_id, name, words, values, worries=False, har
                                      DIAGNOSTICS_TYPE))
 
 
-def diagnostics_value(cdr, name):
+def diagnostics_value(cdr: bytes, name: str) -> tuple[int, dict[str, str]]:
     """(stamp int ns, dict of str to str) of the status of that name, {} without one.
 
     Raises:
         MessageError: the bytes are no DiagnosticArray.
     """
     try:
-        message = TYPES.deserialize_cdr(cdr, DIAGNOSTICS_TYPE)
+        message = cast(DiagnosticArray, TYPES.deserialize_cdr(cdr, DIAGNOSTICS_TYPE))
     except Exception as error:  # the library raises whatever the bytes lead it to
         raise MessageError(f"{DIAGNOSTICS_TYPE}: {len(cdr)} bytes that cannot be read ({error})"
                            ) from None

@@ -9,6 +9,7 @@ the default middleware; anything else is refused.
 """
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,24 +32,25 @@ class Layout:
     the numbers before, the doubles and the numbers after, all as float64.
     """
 
-    def __init__(self, msgtype, before="", after="", child=False, **doubles):
+    def __init__(self, msgtype: str, before: str = "", after: str = "", child: bool = False,
+                 **doubles: int):
         self.msgtype = msgtype
         self.child = child
         self._before, self._after = before, after
         self._count = sum(doubles.values())
-        self._slices = {}
+        self._slices: dict[str, slice] = {}
         position = len(before)
         for name, count in doubles.items():
             self._slices[name] = slice(position, position + count)
             position += count
         self.size = position + len(after)
-        self._prefixes = {}
+        self._prefixes: dict[tuple[str, str], bytes] = {}
         self._rest = {order: struct.Struct(f"{order}{self._count}d{after}") for order in "<>"}
 
-    def __getitem__(self, field):
+    def __getitem__(self, field: str) -> slice:
         return self._slices[field]
 
-    def decode(self, cdr):
+    def decode(self, cdr: bytes) -> tuple[int, str, np.ndarray]:
         """Decode one message.
 
         Args:
@@ -72,7 +74,7 @@ class Layout:
                 start = 4 + _align(end - 4, 4)
                 (length,) = struct.unpack_from(order + "I", cdr, start)
                 end = start + 4 + length
-            values = ()
+            values: tuple = ()
             for code in self._before:
                 size = struct.calcsize(code)
                 end = 4 + _align(end - 4, size)
@@ -83,7 +85,8 @@ class Layout:
             raise MessageError(f"{self.msgtype}: {len(cdr)} bytes are too few ({error})") from None
         return sec * NANOSECONDS + nanosec, frame_id, np.array(values, dtype=np.float64)
 
-    def decode_many(self, messages):
+    def decode_many(self, messages: Sequence[bytes]
+                    ) -> tuple[np.ndarray, list[str], np.ndarray]:
         """Decode a list of messages at once.
 
         Returns:
@@ -98,7 +101,8 @@ class Layout:
             frames.append(frame_id)
         return stamps, frames, values
 
-    def encode(self, stamp, frame_id, values, child_frame_id=""):
+    def encode(self, stamp: int, frame_id: str, values: Sequence[float] | np.ndarray,
+               child_frame_id: str = "") -> bytes:
         """The CDR bytes of one message (little endian, padding zero).
 
         Args:

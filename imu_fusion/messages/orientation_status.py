@@ -8,8 +8,7 @@ bias as a geometry_msgs/TwistWithCovarianceStamped.
 import numpy as np
 
 from imu_fusion.estimation.orientation import state as st
-from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
-                                             diagnostics_value)
+from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import TWIST
 
 FLAGS_TYPE = DIAGNOSTICS_TYPE

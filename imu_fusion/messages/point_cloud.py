@@ -34,7 +34,8 @@ def _description(frame_id, names, count):
     return _pad(body, 4) + struct.pack("<III", step, step * count, step * count)
 
 
-def cloud_message(stamp, frame_id, names, points):
+def cloud_message(stamp: int, frame_id: str, names: tuple[str, ...],
+                  points: np.ndarray) -> bytes:
     """CDR bytes of an unordered PointCloud2 of float32 fields.
 
     Args:

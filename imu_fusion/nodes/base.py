@@ -4,7 +4,9 @@ import importlib
 import os
 import signal
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar, cast
 
 import rclpy
 import rclpy.node
@@ -24,7 +26,9 @@ from imu_fusion.kernels import is_compiling
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
-from imu_fusion.parameters.declare import unknown_parameter
+from imu_fusion.parameters.declare import ParameterInfo, Parameters, unknown_parameter
+
+P = TypeVar("P", bound=Parameters)
 
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
@@ -38,7 +42,7 @@ _ROS_TYPES = {
 _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
-def message_class(msgtype):
+def message_class(msgtype: str) -> type:
     """The Python class of 'package/msg/Name'.
 
     Raises:
@@ -52,7 +56,7 @@ def message_class(msgtype):
                          f"'{msgtype.split('/')[0]}' or leave its topics out") from None
 
 
-def descriptor(info):
+def descriptor(info: ParameterInfo) -> ParameterDescriptor:
     """The rcl_interfaces ParameterDescriptor of a ParameterInfo."""
     text = f"{info.doc} [{info.unit}]" if info.unit else info.doc
     result = ParameterDescriptor(name=info.name, description=text, read_only=info.read_only,
@@ -81,41 +85,37 @@ class Node(rclpy.node.Node):
             are relative to them.
     """
 
-    NAME = ""
-    PARAMETERS = ()
-    OPEN_PREFIXES = ()
+    NAME: str = ""
+    PARAMETERS: tuple[type[Parameters], ...] = ()
+    OPEN_PREFIXES: tuple[str, ...] = ()
 
-    def __init__(self, params_files=(), **kwargs):
+    def __init__(self, params_files: Sequence[str] = (), **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
                          **kwargs)
         self.finished = False
+        self.problems: list[str] = []  # what should not have happened: the exit code is then 1
         self._params = self._declare(params_files)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._diagnostics = None
 
-    def params(self, cls):
+    def params(self, cls: type[P]) -> P:
         """The present values of one of the node's PARAMETERS dataclasses."""
-        return self._params[cls]
+        return cast(P, self._params[cls])
 
-    def work(self):
+    def work(self) -> float:
         """Called between callbacks; returns the seconds that the executor may wait."""
         return IDLE
 
-    def stop(self):
+    def stop(self) -> None:
         """Asked to end (signal): do what is needed until ``finished`` is true."""
         self.finished = True
 
-    @property
-    def exit_code(self) -> int:
-        """With what the process ends: 1 if something happened that the user must know of."""
-        return 0
-
-    def close(self):
+    def close(self) -> None:
         """Release files; called once, whatever happened."""
 
-    def start_diagnostics(self, status):
+    def start_diagnostics(self, status: Callable[[], tuple[bytes, str, Mapping[str, object]]]
+                          ) -> None:
         """Publish ``status() -> (level, message, {key: value})`` on `diagnostics` at 1 Hz."""
-        self._diagnostics = self.create_publisher(DiagnosticArray, "diagnostics", 10)
+        publisher = self.create_publisher(DiagnosticArray, "diagnostics", 10)
 
         def publish():
             level, message, values = status()
@@ -123,7 +123,7 @@ class Node(rclpy.node.Node):
                 level=level, name=self.get_fully_qualified_name().lstrip("/"), message=message,
                 values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
             array.header.stamp = self.get_clock().now().to_msg()
-            self._diagnostics.publish(array)
+            publisher.publish(array)
 
         steady_timer(self, 1.0, publish)
 
@@ -133,7 +133,7 @@ class Node(rclpy.node.Node):
         given = {}
         for name, parameter in self.get_parameters_by_prefix("").items():
             if not name.startswith(_FOREIGN):
-                value = parameter.value
+                value = cast(Parameter, parameter).value
                 given[name] = value.tolist() if hasattr(value, "tolist") else value
                 self.undeclare_parameter(name)
         known = {info.name: info for cls in self.PARAMETERS for info in cls.infos()}
@@ -146,9 +146,9 @@ class Node(rclpy.node.Node):
             raise ParameterError(f"{unknown_parameter(unknown[0], self.PARAMETERS)} "
                                  f"(from node {self.get_name()})")
         parameter_file.resolve_paths(given, self.PARAMETERS, self.get_name(), params_files)
-        values = {}
+        values: dict[type[Parameters], Parameters] = {}
         for cls in self.PARAMETERS:
-            own = {}
+            own: dict[str, object] = {}
             for info in cls.infos():
                 value = given.get(info.name)
                 if info.name in given and info.is_tuple and not isinstance(value, bool):
@@ -183,11 +183,11 @@ class Node(rclpy.node.Node):
         self._params = changed
         return SetParametersResult(successful=True)
 
-    def apply(self, params):
+    def apply(self, params: Mapping[type[Parameters], Parameters]) -> None:
         """Parameters are about to change to ``params`` (class to object); may refuse."""
 
 
-def run_node(node_class, args=None):
+def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
     """The main() of a node.
 
     Runs until the node is finished or SIGINT, SIGTERM or a shutdown of the context
@@ -238,7 +238,7 @@ def run_node(node_class, args=None):
             signal.signal(number, handler)
 
 
-def use_fast_heartbeats():
+def use_fast_heartbeats() -> None:
     """Let Fast DDS notice lost messages soon, unless the user has profiles of their own."""
     if not {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"} & os.environ.keys():
         os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(
@@ -265,12 +265,12 @@ def _run(node_class, signals, params_files):
         finally:
             executor.shutdown()
             node.destroy_node()
-    return node.exit_code
+    return 1 if node.problems else 0
 
 
-def usage(node_class):
+def usage(node_class: type[Node]) -> str:
     """The text of --help: what the node does, its services and its parameters."""
-    lines = [node_class.__doc__.strip().splitlines()[0], "",
+    lines = [(node_class.__doc__ or "").strip().partition("\n")[0], "",
              f"usage: {node_class.NAME} [--ros-args -p NAME:=VALUE ... -r FROM:=TO ...]", ""]
     if node_class.NAME in NODES and NODES[node_class.NAME].services:
         lines += ["services (std_srvs/Trigger): " + ", ".join(

@@ -1,6 +1,8 @@
 """What the nodes of all streaming estimators share: a Stream between DDS topics."""
 
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
@@ -8,7 +10,7 @@ from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
-from imu_fusion.streams.stream import EstimatorNodeParams
+from imu_fusion.streams.stream import EstimatorNodeParams, Stream
 
 
 class EstimatorNode(Node):
@@ -19,13 +21,13 @@ class EstimatorNode(Node):
         self._announcing = ExitStack()
         self._announcing.enter_context(announced_compiling(self.get_logger().info))
 
-    def close(self):
+    def close(self) -> None:
         self._announcing.close()
         super().close()
 
-    def attach(self, stream, outputs):
+    def attach(self, stream: Stream, outputs: Mapping[str, str]) -> None:
         """Subscribe to the stream's inputs and advertise ``outputs`` (topic to type name)."""
-        self._stream = stream
+        self._stream: Any = stream  # of the kind that the subclass has made
         self._relay = Relay(self, self)
         self._outputs = {topic: self._relay.publisher(message_class(msgtype), topic)
                          for topic, msgtype in outputs.items()}
@@ -38,29 +40,29 @@ class EstimatorNode(Node):
             self._names[inbox.topic] = topic
         self.start_diagnostics(self._status)
 
-    def emit(self, topic, stamp, cdr):
+    def emit(self, topic: str, stamp: int, cdr: bytes) -> None:
         """Publish what the stream has made."""
         self._outputs[topic].publish(cdr)
 
-    def summary(self):
+    def summary(self) -> dict:
         """Values of the estimator for diagnostics; subclasses add theirs."""
         return {}
 
     # The processor of the relay: see nodes/flow/relay.py.
 
-    def reset(self, topics):
+    def reset(self, topics: Sequence[str]) -> None:
         self._stream.reset([self._names[topic] for topic in topics])
 
-    def step(self):
+    def step(self) -> bool:
         return self._stream.step()
 
-    def topic_ended(self, topic):
+    def topic_ended(self, topic: str) -> None:
         self._stream.topic_ended(self._names[topic])
 
-    def finish(self):
+    def finish(self) -> None:
         self._stream.finish()
 
-    def stop(self):
+    def stop(self) -> None:
         self._relay.close()
         super().stop()
 

@@ -55,7 +55,9 @@ def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
         if name not in STAGES or name == SMOOTHER:
             raise TopicError(f"no estimator '{name}' to leave out; there are: "
                              + ", ".join(node for node in STAGES if node != SMOOTHER))
-    estimators, renamed, made = [], {}, set()
+    estimators: list[str] = []
+    renamed: dict[str, str] = {}
+    made: set[str] = set()
     with open_bag(bag) as reader:
         for stage in STAGES.values():
             # Here, for a bad file to be refused before anything starts.
@@ -98,14 +100,14 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         ImuFusionError: recording, parameters or topics are not usable, or a node failed.
     """
     plan = plan_pipeline(bag, params_file, without, remap)
-    common = {"params_file": params_file and Path(params_file).absolute()}
+    file = Path(params_file).absolute() if params_file else None
     with NodeProcesses(logs) as nodes:
-        nodes.start("recorder", **common, out=str(Path(out).absolute()), overwrite=overwrite,
-                    end_with_sources=True, expected_sources=(SMOOTHER,))
+        nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
+                    overwrite=overwrite, end_with_sources=True, expected_sources=(SMOOTHER,))
         for node in plan.estimators:
-            nodes.start(node, **common, qos="reliable")
-        nodes.start("smoothing_trigger", show=show, **common)
-        nodes.start("replayer", show=show, **common, **plan.replay_parameters(bag))
+            nodes.start(node, params_file=file, qos="reliable")
+        nodes.start("smoothing_trigger", show=show, params_file=file)
+        nodes.start("replayer", show=show, params_file=file, **plan.replay_parameters(bag))
         nodes.wait("replayer", _PATIENCE)
         nodes.wait("smoothing_trigger", _PATIENCE)
         # Rarely the recorder does not notice the end of the smoother's session (why is not

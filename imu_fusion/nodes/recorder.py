@@ -3,9 +3,11 @@
 import re
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
 from imu_fusion.nodes.base import Node, message_class, run_node
@@ -35,14 +37,14 @@ class RecorderParams(Parameters):
         (), doc="names of nodes that may begin later: do not close before they have ended, too")
 
 
-def offered(info):
+def offered(info: TopicEndpointInfo) -> dict:
     """The rosbag2 QoS profile of a publisher's endpoint info."""
     qos = info.qos_profile
     return qos_profile(qos.depth, qos.reliability.name.lower(), qos.durability.name.lower(),
                        qos.history.name.lower())
 
 
-def adapted_qos(infos):
+def adapted_qos(infos: Sequence[TopicEndpointInfo]) -> QoSProfile:
     """A subscription QoS that all of these publishers match: as strict as the laxest."""
     reliable = all(i.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for i in infos)
     latched = bool(infos) and all(
@@ -84,7 +86,7 @@ class Recorder(Node):
         steady_timer(self, 0.2, self._discover)
         self.start_diagnostics(lambda: (b"\0", "recording", dict(self._writer.counts)))
 
-    def close(self):
+    def close(self) -> None:
         """Close the recording and say what is in it."""
         if self._failed:
             self._writer.abandon()
@@ -167,6 +169,6 @@ def _compile(name, pattern):
                              f"expression ({error})") from None
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     return run_node(Recorder, args)

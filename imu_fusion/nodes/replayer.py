@@ -3,6 +3,7 @@
 import fnmatch
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rclpy.qos import DurabilityPolicy
@@ -78,7 +79,7 @@ class Replayer(Node):
         self._clock_out = self.create_publisher(
             Clock, "/clock", reliable_qos(10)) if p.clock else None
         self._next_clock = 0
-        self._messages = iter(())
+        self._messages: Iterator[tuple[str, str, int, bytes]] = iter(())
         self._next = None  # (topic, log time, bytes) that is due next
         self._phase = self._wait
         self._waiting_since = time.monotonic()
@@ -97,13 +98,13 @@ class Replayer(Node):
         self.start_diagnostics(lambda: (b"\0", self._phase.__name__.strip("_"), {
             publisher.topic: publisher.sent for publisher in self._outputs.values()}))
 
-    def work(self):
+    def work(self) -> float:
         """Do what the present phase asks for; see :meth:`Node.work`."""
         if self._deadline is not None and time.monotonic() > self._deadline:
             self.finished = True
         return self._phase()
 
-    def stop(self):
+    def stop(self) -> None:
         """End the session, so that whoever listens knows; wait for that only briefly."""
         self._deadline = time.monotonic() + 2.0
         self._next = None
@@ -112,7 +113,7 @@ class Replayer(Node):
         elif self._phase != self._drain:
             self._end(END)
 
-    def close(self):
+    def close(self) -> None:
         """Close the recording and say what was sent to whom."""
         self._progress.close()
         self._bag.close()
@@ -171,7 +172,7 @@ class Replayer(Node):
 
     def _join(self):
         """All our nodes on the graph must have answered."""
-        if self._clock_out is not None and self._next is not None:
+        if self._next is not None:
             self._publish_clock(self._next[1])
             self._next_clock = 0
         if not self._source.ready():
@@ -199,8 +200,7 @@ class Replayer(Node):
                 wait = self._time_to_wait(log_time)
                 if wait > 0.0:
                     return min(wait, _BLOCKED)
-            if self._clock_out is not None:
-                self._publish_clock(log_time)
+            self._publish_clock(log_time)
             publisher.publish(data)
             self._steps -= self._steps > 0
             self._advance()
@@ -242,7 +242,7 @@ class Replayer(Node):
         return started + (log_time - first) * 1e-9 / pace - now
 
     def _publish_clock(self, log_time):
-        if log_time >= self._next_clock:
+        if self._clock_out is not None and log_time >= self._next_clock:
             p = self.params(ReplayerParams)
             self._clock_out.publish(Clock(clock=Time(nanoseconds=log_time).to_msg()))
             self._next_clock = log_time + round(1e9 * (p.rate or 1.0) / p.clock)
@@ -330,6 +330,6 @@ def _remapping(bag, rules):
     return renamed
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     return run_node(Replayer, args)

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from std_srvs.srv import Trigger
@@ -43,7 +44,7 @@ class SmoothingTrigger(Node):
         for topic, kind in INPUTS.items():
             self._sink.subscribe(message_class(kind.layout.msgtype), topic, lambda cdr, info: None)
 
-    def work(self):
+    def work(self) -> float:
         """See :meth:`Node.work`."""
         if self._source is None:
             return IDLE
@@ -84,6 +85,6 @@ class SmoothingTrigger(Node):
             self._seen_at = time.monotonic()
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(SmoothingTrigger, args)

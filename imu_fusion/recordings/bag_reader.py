@@ -6,6 +6,7 @@ by chunk with ``mcap``.
 
 import struct
 from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,10 +30,10 @@ class TopicInfo:
     name: str
     msgtype: str
     count: int | None
-    qos_profiles: list = field(default_factory=list)
+    qos_profiles: list[dict] = field(default_factory=list)
 
 
-def open_bag(path):
+def open_bag(path: str | Path) -> "Reader":
     """Open a recording for reading: a context manager with ``topics`` and ``messages``.
 
     Args:
@@ -82,28 +83,38 @@ def _split_index(path):
 class Reader:
     """What every reader offers; ``warnings`` says what is wrong with the recording."""
 
-    def __init__(self, path):
+    def __init__(self, path: str | Path):
         self.path = Path(path)
-        self.topics = {}
+        self.topics: dict[str, TopicInfo] = {}
         self.start_time = self.end_time = 0
-        self.warnings = []
+        self.warnings: list[str] = []
         self.typestore = TYPES
 
-    def __enter__(self):
+    def __enter__(self) -> "Reader":
         return self
 
     def __exit__(self, *_):
         self.close()
 
-    def close(self):
+    def close(self) -> None:
         """Release the files."""
 
-    @property
-    def count(self):
-        """Number of messages."""
-        return sum(info.count for info in self.topics.values())
+    def messages(self, topics: Collection[str] | None = None, start: int | None = None,
+                 stop: int | None = None) -> Iterator[tuple[str, str, int, bytes]]:
+        """Yield (topic, msgtype, log time int nanoseconds, CDR bytes) in order of log time.
 
-    def require(self, name, msgtype=None):
+        Args:
+            topics: names to yield; None for all.
+            start, stop: bounds of the log time, start inclusive, stop exclusive.
+        """
+        raise NotImplementedError
+
+    @property
+    def count(self) -> int:
+        """Number of messages."""
+        return sum(info.count or 0 for info in self.topics.values())
+
+    def require(self, name: str, msgtype: str | None = None) -> TopicInfo:
         """The TopicInfo of ``name`` (with or without leading slash), or a TopicError."""
         key = find_topic(self.topics, name)
         if key is None:
@@ -114,13 +125,13 @@ class Reader:
             raise TopicError(f"{self.path}: topic '{name}' is {info.msgtype}, expected {msgtype}")
         return info
 
-    def definition(self, msgtype):
+    def definition(self, msgtype: str) -> tuple[str, str]:
         """(ros2msg definition with its dependencies, RIHS01 hash) of a type in this recording."""
         return self.typestore.generate_msgdef(msgtype, ros_version=2)[0], \
             self.typestore.hash_rihs01(msgtype)
 
 
-def find_topic(names, wanted):
+def find_topic(names: Iterable[str], wanted: str) -> str | None:
     """The entry of ``names`` that is ``wanted`` up to a leading slash, or None."""
     for candidate in (wanted, "/" + wanted.lstrip("/"), wanted.lstrip("/")):
         if candidate in names:
@@ -158,12 +169,6 @@ class _IndexedReader(Reader):
         self._reader.close()
 
     def messages(self, topics=None, start=None, stop=None):
-        """Yield (topic, msgtype, log time int nanoseconds, CDR bytes) in order of log time.
-
-        Args:
-            topics: names to yield; None for all.
-            start, stop: bounds of the log time, start inclusive, stop exclusive.
-        """
         wanted = self.topics if topics is None else topics
         connections = [c for c in self._reader.connections
                        if c.topic in wanted and c.topic in self.topics]
@@ -172,7 +177,7 @@ class _IndexedReader(Reader):
         try:
             for connection, log_time, data in self._reader.messages(connections, start, stop):
                 if self._is_ros1:
-                    data = TYPES.ros1_to_cdr(data, connection.msgtype)
+                    data = bytes(TYPES.ros1_to_cdr(data, connection.msgtype))
                 yield connection.topic, connection.msgtype, log_time, data
         except KeyError as error:
             raise BagError(f"{self.path}: type {error} is not known; only ROS 2 Jazzy's own types "
@@ -197,7 +202,8 @@ class _RecoveringReader(Reader):
     def __init__(self, path, files, reason):
         super().__init__(path)
         self._files = files
-        counts, times = Counter(), []
+        counts: Counter[str] = Counter()
+        times = []
         for topic, _, log_time, _ in self._scan():
             counts[topic] += 1
             times.append(log_time)
@@ -255,7 +261,6 @@ class _RecoveringReader(Reader):
                                  if k not in self.typestore.fielddefs})
 
     def messages(self, topics=None, start=None, stop=None):
-        """As :meth:`_IndexedReader.messages`, in order of log time."""
         rows = [(log_time, i, topic, msgtype, data)
                 for i, (topic, msgtype, log_time, data) in enumerate(self._scan())
                 if (topics is None or topic in topics)

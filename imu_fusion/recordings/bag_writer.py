@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mcap.writer
 import yaml
+from rosbags.typesys.store import Typestore
 
 from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
@@ -45,15 +46,17 @@ class BagWriter:
         BagError: the directory is in the way or cannot be written.
     """
 
-    def __init__(self, directory, compression="zstd", chunk_size=256 * 1024, overwrite=False,
-                 typestore=TYPES):
+    def __init__(self, directory: str | Path, compression: str = "zstd",
+                 chunk_size: int = 256 * 1024, overwrite: bool = False,
+                 typestore: Typestore = TYPES):
         self.directory = Path(directory)
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
         self._typestore = typestore
-        self._channels = {}
-        self._topics = {}
-        self._first = self._last = None
-        self._sequence = Counter()
+        self._channels: dict[str, int] = {}
+        self._topics: dict[str, dict] = {}
+        self._first: int | None = None
+        self._last: int | None = None
+        self._sequence: Counter[str] = Counter()
         self._prepare(overwrite)
         name = self.directory.resolve().name
         self._file = f"{name}_0.mcap"
@@ -83,13 +86,14 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
 
-    def __enter__(self):
+    def __enter__(self) -> "BagWriter":
         return self
 
     def __exit__(self, *_):
         self.close()
 
-    def add_topic(self, topic, msgtype, qos=None, definition=None):
+    def add_topic(self, topic: str, msgtype: str, qos: list[dict] | None = None,
+                  definition: tuple[str, str] | None = None) -> None:
         """Register a topic (done by :meth:`write` when needed).
 
         Args:
@@ -114,7 +118,9 @@ class BagWriter:
                                "offered_qos_profiles": qos, "type_description_hash": digest}
         self.counts[topic] += 0
 
-    def write(self, topic, msgtype, cdr, log_time, publish_time=None, qos=None, definition=None):
+    def write(self, topic: str, msgtype: str, cdr: bytes, log_time: int,
+              publish_time: int | None = None, qos: list[dict] | None = None,
+              definition: tuple[str, str] | None = None) -> None:
         """Append one message.
 
         Args:
@@ -151,7 +157,7 @@ class BagWriter:
             self._stream.flush()
             self._position = position
 
-    def close(self):
+    def close(self) -> None:
         """Write index and metadata; safe to call twice.
 
         Raises:
@@ -171,7 +177,7 @@ class BagWriter:
             with contextlib.suppress(OSError):  # reported above
                 self._stream.close()
 
-    def abandon(self):
+    def abandon(self) -> None:
         """Close the file as it is, after an error: no index, chunks stay readable."""
         with contextlib.suppress(OSError):
             self._stream.close()

@@ -27,12 +27,16 @@ import yaml
 from imu_fusion.errors import BagError, ParameterError, SampleError
 from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
 from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
-from imu_fusion.streams.acceleration_field import (GYROSCOPE_TOPIC, NODE,
-                                                           NODE_PARAMETERS, FieldConfiguration)
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
 from imu_fusion.parameters.declare import Parameters, flatten, param
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.streams.acceleration_field import (
+    GYROSCOPE_TOPIC,
+    NODE,
+    NODE_PARAMETERS,
+    FieldConfiguration,
+)
 
 TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}

@@ -15,6 +15,7 @@ no fix, a speed without direction no velocity, an accuracy that is not logged st
 
 import csv
 import re
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -25,6 +26,9 @@ from imu_fusion.messages.convert import fix_message, imu_message, mag_message, v
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, TWIST
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.csv_import import read_number
+
+Messages = Iterator[tuple[str, str, int, bytes]]    # topic, msgtype, stamp in ns, CDR
+Importer = Callable[[Path], Messages]
 
 PHYPHOX_EPOCH = AVANODE_EPOCH = 1_600_000_000_000_000_000
 STANDARD_GRAVITY = 9.80665
@@ -42,7 +46,7 @@ _IMU_COLUMNS = ("time", "acc x", "acc y", "acc z", "gyro x", "gyro y", "gyro z",
                 "mag x", "mag y", "mag z")
 
 
-def importer_of(source):
+def importer_of(source: str | Path) -> Importer | None:
     """The function of this module that yields (topic, msgtype, stamp, cdr) of a source.
 
     Returns:
@@ -62,7 +66,8 @@ def importer_of(source):
     return None
 
 
-def import_files(importer, source, out, overwrite=False):
+def import_files(importer: Importer, source: str | Path, out: str | Path,
+                 overwrite: bool = False) -> dict[str, int]:
     """Convert a source with what :func:`importer_of` gave for it: a rosbag2 directory ``out``.
 
     Returns:
@@ -79,7 +84,7 @@ def import_files(importer, source, out, overwrite=False):
     return dict(writer.counts)
 
 
-def phyphox(folder):
+def phyphox(folder: Path) -> Messages:
     """Messages of a phyphox export.
 
     The accelerometer is interpolated to the stamps of the gyroscope, whose samples are what is
@@ -157,7 +162,7 @@ def _interpolated(stamp, source_stamp, values):
     return keep, np.column_stack([np.interp(since, source_since, v) for v in values.T])
 
 
-def avanode_imu(path):
+def avanode_imu(path: Path) -> Messages:
     """Messages of an AvaNode IMU log.
 
     Its magnetometer is slower than its other sensors: a reading that only repeats the one
@@ -201,7 +206,7 @@ def _avanode_factors(path, lines):
     raise SampleError(f"{path}: no line '#date,factor acc,factor gyro,factor mag,sync,id#'")
 
 
-def avanode_gnss(path):
+def avanode_gnss(path: Path) -> Messages:
     """Messages of an AvaNode GNSS log; heights are taken as ellipsoidal.
 
     Stamps are UTC, its fraction from the receiver's time of week (they differ by whole seconds).
@@ -217,7 +222,8 @@ def avanode_gnss(path):
     for k, (line, row) in enumerate(rows):
         fixed = fix_type[k] in _FIX_3D
         try:
-            date = datetime(*map(int, row[utc].split(":")), tzinfo=UTC)
+            year, month, day, hour, minute, second = map(int, row[utc].split(":"))
+            date = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
             stamp = int(date.timestamp()) * NANOSECONDS + round(tow[k] % 1000) * 1_000_000
         except (ValueError, TypeError, IndexError):
             if not fixed:

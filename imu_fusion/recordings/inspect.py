@@ -9,8 +9,10 @@ from imu_fusion.errors import MessageError
 from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.layouts import NANOSECONDS
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
+from imu_fusion.samples.logs import Log
 
 _HEADER = "std_msgs/msg/Header"
 
@@ -34,27 +36,27 @@ class TopicReport:
     topic: str
     msgtype: str
     stamp: np.ndarray = field(repr=False, compare=False)
-    ranges: tuple = ()
-    findings: tuple = ()
+    ranges: tuple[Range, ...] = ()
+    findings: tuple[checks.Finding, ...] = ()
     stamped: bool = True
-    log: object = field(default=None, repr=False, compare=False)
+    log: Log | None = field(default=None, repr=False, compare=False)
     timing: checks.Timing = field(init=False)
 
     def __post_init__(self):
         object.__setattr__(self, "timing", checks.timing(self.stamp))
 
     @property
-    def count(self):
+    def count(self) -> int:
         """Number of messages."""
         return self.timing.count
 
     @property
-    def rate(self):
+    def rate(self) -> float | None:
         """Mean rate in Hz, None with fewer than two stamps or without a header."""
         return self._or_none(self.timing.rate_hz)
 
     @property
-    def longest_gap(self):
+    def longest_gap(self) -> float | None:
         """Longest interval in s, None with fewer than two stamps or without a header."""
         return self._or_none(self.timing.longest_gap_s)
 
@@ -62,12 +64,12 @@ class TopicReport:
         return None if not self.stamped or np.isnan(value) else value
 
     @property
-    def notes(self):
+    def notes(self) -> list[str]:
         """The findings in words, without the name of the topic."""
         return [finding.text.removeprefix(self.topic + ": ") for finding in self.findings]
 
 
-def inspect_topics(reader):
+def inspect_topics(reader: Reader) -> list[TopicReport]:
     """Inspect every topic of an open recording.
 
     Args:
@@ -91,8 +93,9 @@ def inspect_topics(reader):
     return [_with_axes(report, imus) for report in reports]
 
 
-def inspect_log(name, msgtype, log):
+def inspect_log(name: str, msgtype: str, log: Log) -> TopicReport:
     """TopicReport of one log."""
+    ranges: tuple[Range | None, ...] = ()
     if isinstance(log, ImuLog):
         findings = checks.check_imu(log, name)
         ranges = (_range("|angular velocity|", "rad/s", _norm(log.gyr)),
@@ -111,11 +114,10 @@ def inspect_log(name, msgtype, log):
         ranges = (_range("speed", "m/s", _norm(log.vel_world)),)
     else:
         findings = checks.check_stamps(log.stamp, name)
-        ranges = ()
         if isinstance(log, PoseLog):
             findings += checks.check_finite(log.quat_world_imu, name, "orientation")
-    return TopicReport(name, msgtype, log.stamp, (r for r in ranges if r is not None),
-                       tuple(findings), log=log)
+    return TopicReport(name, msgtype, log.stamp,
+                       tuple(r for r in ranges if r is not None), tuple(findings), log=log)
 
 
 def _with_axes(report, imus):
@@ -130,14 +132,14 @@ def _inspect_stamps(reader, name, info):
     """TopicReport of a topic whose contents are not looked at."""
     fields = reader.typestore.fielddefs.get(info.msgtype, ((), ()))[1]
     stamped = bool(fields) and fields[0][1][1] == _HEADER
-    stamps = []
+    times = []
     for _, _, log_time, cdr in reader.messages([name]):
         if stamped and len(cdr) >= 12:
             sec, nanosec = struct.unpack_from("<iI" if cdr[1] else ">iI", cdr, 4)
-            stamps.append(sec * NANOSECONDS + nanosec)
+            times.append(sec * NANOSECONDS + nanosec)
         else:
-            stamps.append(log_time)
-    stamps = np.array(stamps, dtype=np.int64)
+            times.append(log_time)
+    stamps = np.array(times, dtype=np.int64)
     # Messages without a header, or about changes, are sent at any time: gaps mean nothing.
     findings = [finding for finding in checks.check_stamps(stamps, name)
                 if stamped and (finding.kind != "gap" or info.msgtype != FLAGS_TYPE)]

@@ -1,6 +1,7 @@
 """One topic of a recording as a typed log."""
 
 from collections.abc import Callable
+from typing import Any
 
 from imu_fusion.errors import TopicError
 from imu_fusion.messages.convert import SAMPLE_TYPES
@@ -8,8 +9,8 @@ from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.samples.logs import Log
 
 
-def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = None) -> Log:
-    """The log of one topic of an open recording.
+def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = None) -> Any:
+    """The log of one topic of an open recording: which subclass of Log, its type decides.
 
     Args:
         reader: what :func:`imu_fusion.recordings.bag_reader.open_bag` returned.

@@ -6,7 +6,8 @@ BEST_EFFORT = "best_effort"
 _UNLIMITED = {"sec": 2147483647, "nsec": 4294967295}
 
 
-def qos_profile(depth=10, reliability=RELIABLE, durability="volatile", history="keep_last"):
+def qos_profile(depth: int = 10, reliability: str = RELIABLE, durability: str = "volatile",
+                history: str = "keep_last") -> dict:
     """The offered QoS of one topic as rosbag2 (metadata version 9) stores it."""
     return {"history": history, "depth": int(depth), "reliability": reliability,
             "durability": durability, "deadline": dict(_UNLIMITED), "lifespan": dict(_UNLIMITED),

@@ -1,10 +1,12 @@
 """A clean copy of a damaged recording."""
 
+from pathlib import Path
+
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 
 
-def repair(path, directory):
+def repair(path: str | Path, directory: str | Path) -> dict[str, int]:
     """Copy all that can be read of ``path`` into a new, clean recording.
 
     Returns:

@@ -6,7 +6,8 @@ import numpy as np
 POINTS = 3000
 
 
-def decimate(time, values, points=POINTS):
+def decimate(time: np.ndarray, values: np.ndarray, points: int = POINTS
+             ) -> tuple[np.ndarray, np.ndarray]:
     """The least and the greatest sample of every stretch of a signal, in order.
 
     Args:
@@ -40,7 +41,8 @@ def decimate(time, values, points=POINTS):
     return time[index], values[index]
 
 
-def envelope(time, low, high, points=POINTS):
+def envelope(time: np.ndarray, low: np.ndarray, high: np.ndarray, points: int = POINTS
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A band made short: the lowest ``low`` and highest ``high`` of every stretch.
 
     Args:

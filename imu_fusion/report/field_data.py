@@ -5,17 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.acceleration_field.rows import (ROW, SATURATED, field_at,
-                                                           rigid_gradient)
 from imu_fusion.estimation.acceleration_field.impact_metrics import measure_impacts
-from imu_fusion.streams.acceleration_field import (ACCEL_TOPIC, GYROSCOPE_TOPIC, IMU_TOPIC,
-                                                           NODE, FieldConfiguration,
-                                                           read_configuration)
-from imu_fusion.recordings.bag_reader import find_topic, open_bag
+from imu_fusion.estimation.acceleration_field.rows import ROW, SATURATED, field_at, rigid_gradient
 from imu_fusion.messages.convert import attitude_log
+from imu_fusion.messages.layouts import ACCEL, IMU
+from imu_fusion.recordings.bag_reader import find_topic, open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.results import read_results
-from imu_fusion.messages.layouts import ACCEL, IMU
+from imu_fusion.streams.acceleration_field import (
+    ACCEL_TOPIC,
+    GYROSCOPE_TOPIC,
+    IMU_TOPIC,
+    NODE,
+    FieldConfiguration,
+    read_configuration,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ every figure of a report.
 """
 
 import html
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,7 @@ class Panel:
     from outside) stands in the lower left corner."""
 
     label: str
-    items: tuple
+    items: tuple[Line | Band, ...]
     title: str = ""
     from_zero: bool = False
 
@@ -69,17 +70,18 @@ class Shade:
     """Spans [(start, end)] s that are marked in every panel; ``name`` is for the legend."""
 
     name: str
-    spans: tuple
+    spans: tuple[tuple[float, float], ...]
     color: str = NEUTRAL
     opacity: float = 0.11
 
 
-def plain(text):
+def plain(text: object) -> str:
     """Text from outside for plotly, which reads a subset of HTML in names and labels."""
     return html.escape(str(text), quote=False)
 
 
-def time_figure(panels, shades=(), panel_height=205):
+def time_figure(panels: Sequence[Panel], shades: Sequence[Shade] = (), panel_height: int = 205
+                ) -> go.Figure:
     """Panels below each other over one time axis in seconds.
 
     Args:
@@ -89,7 +91,7 @@ def time_figure(panels, shades=(), panel_height=205):
     """
     figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True,
                            vertical_spacing=0.12 / max(len(panels), 3))
-    named = set()
+    named: set[str] = set()
     for row, panel in enumerate(panels, start=1):
         for item in panel.items:
             for trace in _traces(item, named):
@@ -120,7 +122,7 @@ def time_figure(panels, shades=(), panel_height=205):
     return figure
 
 
-def style(figure, height):
+def style(figure: go.Figure, height: int) -> None:
     """Fonts, margins, grid and axes that all figures share. height: pixels."""
     figure.update_layout(
         height=height, margin=dict(l=84, r=18, t=52, b=48), template="none",
@@ -132,21 +134,21 @@ def style(figure, height):
     figure.update_yaxes(**line)
 
 
-def intervals(time, mask):
+def intervals(time: np.ndarray, mask: np.ndarray) -> list[tuple[float, float]]:
     """The stretches [(start, end)] s over which ``mask`` (n,) bool at ``time`` (n,) is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     last = len(time) - 1
     return [(float(time[a]), float(time[min(b, last)])) for a, b in zip(edges[::2], edges[1::2])]
 
 
-def break_wraps(angle_deg):
+def break_wraps(angle_deg: np.ndarray) -> np.ndarray:
     """Angles (n,) with NaN where they jump by more than half a turn, so that no line is drawn."""
     result = np.array(angle_deg, dtype=np.float64)
     result[1:][np.abs(np.diff(result)) > 180.0] = np.nan
     return result
 
 
-def break_gaps(time, values):
+def break_gaps(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A signal with NaN put into its gaps: intervals of more than ten usual ones."""
     step = np.diff(time)
     if len(step) == 0:
@@ -201,9 +203,10 @@ def _duration(panels):
     return max(float(t[-1]) for t in times) - min(float(t[0]) for t in times) if times else 0.0
 
 
-def merged(spans, resolution):
+def merged(spans: Iterable[tuple[float, float]], resolution: float
+           ) -> list[tuple[float, float]]:
     """Spans in order, those less than ``resolution`` (s) apart as one, each at least as long."""
-    result = []
+    result: list[tuple[float, float]] = []
     for start, end in sorted(spans):
         end = max(end, start + resolution)
         if result and start - result[-1][1] < resolution:

@@ -9,10 +9,10 @@ from imu_fusion.report.decimate import POINTS
 from imu_fusion.report.figures import Line, Panel, time_figure
 from imu_fusion.report.html import Figure, Section, Table, Text
 from imu_fusion.report.overview import number
-from imu_fusion.samples import seconds
+from imu_fusion.samples import FixLog, VelocityLog, seconds
 
 
-def gnss_section(fix, velocity, origin):
+def gnss_section(fix: FixLog, velocity: VelocityLog | None, origin: int) -> Section:
     """Section with the track, height, speed and stated standard deviations.
 
     Args:

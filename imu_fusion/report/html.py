@@ -9,6 +9,7 @@ import base64
 import html
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -30,7 +31,7 @@ class Text:
 
     text: str
 
-    def render(self):
+    def render(self) -> str:
         return f"<p>{html.escape(self.text)}</p>"
 
 
@@ -38,10 +39,10 @@ class Text:
 class Notes:
     """A list of remarks; ``warning`` sets them apart."""
 
-    items: tuple
+    items: tuple[str, ...]
     warning: bool = True
 
-    def render(self):
+    def render(self) -> str:
         rows = "".join(f"<li>{html.escape(item)}</li>" for item in self.items)
         return f'<ul class="{"warning" if self.warning else "plain"}">{rows}</ul>'
 
@@ -59,9 +60,9 @@ class Number:
 class Numbers:
     """Key numbers side by side."""
 
-    items: tuple
+    items: tuple[Number, ...]
 
-    def render(self):
+    def render(self) -> str:
         cards = "".join(
             f'<div class="card"><div class="label">{html.escape(n.label)}</div>'
             f'<div class="value">{html.escape(n.value)}</div>'
@@ -74,11 +75,11 @@ class Table:
     """Rows of cells (text as it shall appear) below a header; columns of numbers are set to the
     right."""
 
-    header: tuple
-    rows: tuple
+    header: tuple[str, ...]
+    rows: tuple[tuple, ...]
     caption: str = ""
 
-    def render(self):
+    def render(self) -> str:
         numeric = [all(_NUMBER.match(str(row[i])) for row in self.rows) for i in
                    range(len(self.header))]
         head = "".join(self._cell("th", *pair) for pair in zip(self.header, numeric))
@@ -102,7 +103,7 @@ class Figure:
     caption: str = ""
     linked: bool = True
 
-    def render(self):
+    def render(self) -> str:
         data = json.dumps(self.figure.to_plotly_json(), default=_binary)
         # Inside <script> only "<" could end the element or open a comment.
         data = data.replace("<", "\\u003c")
@@ -119,21 +120,25 @@ def _binary(value):
     return {"dtype": "f4", "bdata": base64.b64encode(array.tobytes()).decode()}
 
 
+Block = Text | Notes | Numbers | Table | Figure
+
+
 @dataclass(frozen=True)
 class Section:
-    """A heading and its blocks (Text, Notes, Numbers, Table, Figure)."""
+    """A heading and what stands below it."""
 
     title: str
-    blocks: tuple
+    blocks: tuple[Block, ...]
 
 
-def write_report(path, title, sections, subtitle=""):
+def write_report(path: str | Path, title: str, sections: Sequence[Section], subtitle: str = ""
+                 ) -> None:
     """Write one self-contained HTML file.
 
     Args:
         path: file to write; its folder is made if it is missing.
         title, subtitle: heading and the line below it.
-        sections: list of Section.
+        sections: in order.
 
     Raises:
         ImuFusionError: the file cannot be written.
@@ -146,7 +151,7 @@ def write_report(path, title, sections, subtitle=""):
         raise ImuFusionError(f"{path}: the report cannot be written ({error.strerror})") from None
 
 
-def render_report(title, sections, subtitle=""):
+def render_report(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
     """The HTML text of :func:`write_report`."""
     anchors = [re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
                for section in sections]

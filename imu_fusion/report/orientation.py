@@ -65,9 +65,10 @@ def angle_panels(estimate, origin, reference=None, reference_name="reference"):
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
     panels = []
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        items = [Band("estimate, ±3σ", time, angles[:, i] - 3 * sd[:, i],
-                      angles[:, i] + 3 * sd[:, i], widest=180.0),
-                 Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE)]
+        items: list[Line | Band] = [
+            Band("estimate, ±3σ", time, angles[:, i] - 3 * sd[:, i], angles[:, i] + 3 * sd[:, i],
+                 widest=180.0),
+            Line("estimate", time, fig.break_wraps(angles[:, i]), fig.ESTIMATE)]
         if has_reference:
             items.append(Line(reference_name, ref_time, fig.break_wraps(ref_angles[:, i]),
                               fig.REFERENCE, dash="dot", width=1.2))
@@ -266,12 +267,12 @@ def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0, i
     return Numbers(tuple(items))
 
 
-def _mean(time, values):
+def _mean(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(time, mean) of the samples of every whole second."""
     second = np.floor(time).astype(np.int64)
-    starts = np.flatnonzero(np.r_[True, second[1:] != second[:-1]]) if len(time) else []
-    if len(starts) == 0:
+    if len(time) == 0:
         return time, values
+    starts = np.flatnonzero(np.r_[True, second[1:] != second[:-1]])
     count = np.diff(np.r_[starts, len(time)])
     return (np.add.reduceat(time, starts) / count, np.add.reduceat(values, starts) / count)
 

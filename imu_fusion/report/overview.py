@@ -1,9 +1,12 @@
 """The recording at a glance: topics, rates, gaps, ranges, what looks wrong."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from imu_fusion.recordings.inspect import TopicReport
 from imu_fusion.report.figures import ESTIMATE, Band, Line, Panel, time_figure
-from imu_fusion.report.html import Figure, Notes, Section, Table, Text
+from imu_fusion.report.html import Block, Figure, Notes, Section, Table, Text
 from imu_fusion.samples import seconds
 from imu_fusion.samples.checks import GAP_FACTOR
 
@@ -11,11 +14,11 @@ from imu_fusion.samples.checks import GAP_FACTOR
 _PANELS, _STRETCHES = 8, 400
 
 
-def overview_section(topics, origin):
+def overview_section(topics: Sequence[TopicReport], origin: int) -> Section:
     """Section about a whole recording.
 
     Args:
-        topics: list of TopicReport (imu_fusion.recordings.inspect).
+        topics: of every topic of the recording.
         origin: int ns, zero of the time axis.
     """
     rows, ranges = [], []
@@ -28,11 +31,12 @@ def overview_section(topics, origin):
         ranges += [(t.topic, r.quantity, f"{r.low:.6g}", f"{r.high:.6g}", r.unit)
                    for r in t.ranges]
     findings = [finding.text for t in topics for finding in t.findings]
-    blocks = [Table(("topic", "type", "messages", "rate Hz", "jitter ms", "gaps", "longest ms",
-                     "out of order"), tuple(rows),
-                    "By header stamps. Jitter: half the width of the central 68 % of the "
-                    f"intervals. Gaps: intervals above {GAP_FACTOR:g} times the usual one; the "
-                    "longest interval stands beside them.")]
+    blocks: list[Block] = [Table(
+        ("topic", "type", "messages", "rate Hz", "jitter ms", "gaps", "longest ms",
+         "out of order"), tuple(rows),
+        "By header stamps. Jitter: half the width of the central 68 % of the intervals. Gaps: "
+        f"intervals above {GAP_FACTOR:g} times the usual one; the longest interval stands beside "
+        "them.")]
     blocks.append(Notes(tuple(findings)) if findings
                   else Text("Nothing looks wrong: stamps increase, units and magnitudes fit, no "
                             "axis stands at a limit."))
@@ -67,6 +71,6 @@ def _intervals(topic, origin):
                   title=topic.topic, from_zero=True)]
 
 
-def number(value, digits):
+def number(value: float | None, digits: int) -> str:
     """A number for a table, a dash where there is none."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"

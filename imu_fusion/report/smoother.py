@@ -5,15 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother.inputs import valid_fixes
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Section, Table, Text
 from imu_fusion.report.orientation import angle_panels
 from imu_fusion.report.overview import number
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
-from imu_fusion.samples import AttitudeLog, seconds
+from imu_fusion.samples import AttitudeLog, FixLog, VelocityLog, seconds
+from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
 _ENU, _XYZ = ("east", "north", "up"), ("x", "y", "z")
@@ -41,11 +44,11 @@ class Smoothed:
     """A SmootherResult with what it was made from: ``params``, ``surface`` or None, FixLog and
     VelocityLog (or None) and ``origin``, int ns, the zero of the time axes."""
 
-    result: object
-    params: object
-    surface: object
-    fix: object
-    velocity: object
+    result: SmootherResult
+    params: SmootherParams
+    surface: Surface | None
+    fix: FixLog
+    velocity: VelocityLog | None
     origin: int
 
     @property

@@ -6,12 +6,15 @@ adds recordings.
 """
 
 from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from imu_fusion.errors import MessageError
+from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.samples.logs import Log
 from imu_fusion.samples.merge import RESTART, SampleStream
 
 
@@ -40,26 +43,28 @@ class Stream:
     ``look_at`` (texts about first samples).
     """
 
-    same_frame = ()
+    same_frame: tuple[str, ...] = ()
 
-    def __init__(self, inputs, emit, warn=lambda text: None):
+    def __init__(self, inputs: Mapping[str, SampleType],
+                 emit: Callable[[str, int, bytes], object],
+                 warn: Callable[[str], object] = lambda text: None):
         self.inputs = inputs
         self.emit = emit
         self.warn = warn
         self.bad_messages = 0
         self.merged = SampleStream(inputs, self._refused)
-        self._queue = deque()
+        self._queue: deque[tuple] = deque()
         self.reset()
 
-    def reset(self, session_topics=None):
+    def reset(self, session_topics: Sequence[str] | None = None) -> None:
         """Start over: with strict merging of these topics, or live (None)."""
         self.merged.begin(session_topics)
         self._queue.clear()
-        self.frame_ids = {}
-        self._first = {topic: [] for topic in self.inputs}
+        self.frame_ids: dict[str, str] = {}
+        self._first: dict[str, list] = {topic: [] for topic in self.inputs}
         self.restart()
 
-    def push(self, topic, cdr):
+    def push(self, topic: str, cdr: bytes) -> None:
         """Take the bytes of one message; what may happen now is queued for :meth:`step`."""
         kind = self.inputs[topic]
         try:
@@ -79,7 +84,7 @@ class Stream:
                     self.warn(text)
         self._queue.extend(self.merged.add(topic, stamp, sample))
 
-    def step(self):
+    def step(self) -> bool:
         """Process one queued event; False if there is none."""
         if not self._queue:
             return False
@@ -92,26 +97,26 @@ class Stream:
             self.take(topic, stamp, sample)
         return True
 
-    def topic_ended(self, topic):
+    def topic_ended(self, topic: str) -> None:
         """Nothing more comes on this topic in this session."""
         self._queue.extend(self.merged.end(topic))
 
-    def finish(self):
+    def finish(self) -> None:
         """The end of the session: everything that is held back is emitted."""
         while self.step():
             pass
         self.flush()
 
-    def restart(self):
+    def restart(self) -> None:
         raise NotImplementedError
 
-    def take(self, topic, stamp, sample):
+    def take(self, topic: str, stamp: int, sample: np.ndarray) -> None:
         raise NotImplementedError
 
-    def flush(self):
+    def flush(self) -> None:
         raise NotImplementedError
 
-    def look_at(self, topic, logs):
+    def look_at(self, topic: str, logs: Mapping[str, Log]) -> list[str]:
         """Texts about the first samples of ``topic``; ``logs`` maps topics to what there is."""
         return []
 

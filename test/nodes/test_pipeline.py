@@ -94,7 +94,7 @@ def test_a_recording_without_fixes_is_refused_before_anything_starts(tmp_path):
 
 def test_a_bad_surface_is_refused_before_anything_starts(tmp_path):
     params, out = tmp_path / "params.yaml", tmp_path / "out"
-    params.write_text("smoother: {ros__parameters: {surface: nowhere}}")
+    params.write_text("smoother: {ros__parameters: {surface: {file: nowhere}}}")
     bag = write(tmp_path / "bag", 20)
     for call in (run_pipeline, batch.process):
         with pytest.raises(LayoutError, match="nowhere"):
