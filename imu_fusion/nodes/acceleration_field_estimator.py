@@ -23,8 +23,7 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         for cls in NODE_PARAMETERS[1:]:
             values.update(self.params(cls).to_mapping())
         config = FieldConfiguration.from_mapping(values, f"node {self.get_name()}")
-        self.attach(AccelerationFieldStream(config, emit=self.emit,
-                                            warn=self.get_logger().warning), OUTPUTS)
+        self.attach(AccelerationFieldStream(config, warn=self.get_logger().warning), OUTPUTS)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/smooth", self._on_smooth)
 

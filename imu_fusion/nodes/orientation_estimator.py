@@ -1,6 +1,7 @@
 """The orientation estimator as a node: decode, one call, encode."""
 
 import math
+from collections.abc import Iterable
 
 import yaml
 from builtin_interfaces.msg import Time
@@ -15,7 +16,7 @@ from imu_fusion.streams.orientation import (ORIENTATION_TOPIC, OUTPUTS,
                                                     warm_up)
 from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.nodes.base import run_node
-from imu_fusion.nodes.estimator import EstimatorNode
+from imu_fusion.nodes.estimator import EstimatorNode, Messages
 
 
 def transform_broadcast(node):
@@ -60,17 +61,21 @@ class OrientationEstimatorNode(EstimatorNode):
         self._broadcast = transform_broadcast(self) if output.publish_tf else None
         warm_up(self.params(OrientationParams))
         self.attach(OrientationStream(
-            self.params(OrientationParams), output, self.emit,
+            self.params(OrientationParams), output, None,
             self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
             self.create_service(Trigger, f"~/{name}",
                                 lambda _, response, action=action: self._answer(response, action))
 
-    def emit(self, topic, stamp, cdr):
-        super().emit(topic, stamp, cdr)
-        if self._broadcast is not None and topic == ORIENTATION_TOPIC:
-            self._broadcast(transform(cdr, self.params(OrientationOutputParams).fixed_frame))
+    def publish(self, made: Iterable[Messages]) -> None:
+        super().publish(made)
+        if self._broadcast is not None:
+            fixed_frame = self.params(OrientationOutputParams).fixed_frame
+            for topic, _, cdrs in made:
+                if topic == ORIENTATION_TOPIC:
+                    for cdr in cdrs:
+                        self._broadcast(transform(cdr, fixed_frame))
 
     def summary(self):
         return self._stream.estimator.summary()

@@ -19,7 +19,7 @@ from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (INPUTS, OUTPUTS, PER_SAMPLE, Collection,
                                            SmootherNodeParams, SmoothingParams)
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
-from imu_fusion.nodes.flow import FlowSink, FlowSource, reliable_qos, sensor_qos
+from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
 from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
@@ -106,16 +106,18 @@ class SmootherNode(Node):
         super().__init__(**kwargs)
         p = self.params(SmootherNodeParams)
         self._collection = Collection(p.memory_limit * 1e6, self.get_logger().warning)
-        self._sink = FlowSink(self, on_begin=self._on_begin)
+        self._flow = Flow(self, on_begin=self._on_begin)
+        self._source = self._flow.source
+        self.problems = self._flow.problems
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()
+        self._names = {}  # resolved name -> ours
         for topic, kind in INPUTS.items():
-            self._sink.subscribe(message_class(kind.layout.msgtype), topic,
-                                 lambda cdr, _, topic=topic: self._collection.push(topic, cdr), qos)
+            taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos)
+            self._names[taken.topic] = topic
         surface_file = self.params(SmoothingParams).surface.file
         if surface_file:
             load_surface(surface_file)  # a bad file ends the node now
-        self._source = FlowSource(self)
-        self._outputs = {topic: self._source.publisher(message_class(msgtype), topic, _latched(1))
+        self._outputs = {topic: self._flow.output(message_class(msgtype), topic, _latched(1))
                          for topic, msgtype in OUTPUTS.items()}
         self._child = self._answer = self._result = self._messages = None
         # Reentrant: a second call is answered while the first one still waits.
@@ -126,25 +128,28 @@ class SmootherNode(Node):
 
     def work(self):
         """See :meth:`Node.work`."""
+        self._flow.send()
+        turn = self._flow.take()
+        for topic, messages in turn.blocks.items():
+            for cdr, _ in messages:
+                self._collection.push(self._names[topic], cdr)
+        self._flow.finish(turn)
         if self._answer is not None:
             # The executor polls the coroutine of a waiting service without rest.
             time.sleep(_POLL)
             if not self._answer.done() and self._child.poll():
                 self._answer.set_result(self._child.outcome)
             return 0.0
-        return 0.0 if self._publish() else IDLE
+        return 0.0 if self._publish() else self._flow.pause(IDLE)
 
     def close(self):
         """End the child, if there is one."""
+        self._flow.close()
         if self._child is not None:
             self._child.close()
 
-    def stop(self):
-        self._source.end()
-        super().stop()
-
     def _on_begin(self, session):
-        if session.topics.keys() & {self.resolve_topic_name(topic) for topic in INPUTS}:
+        if session.said.topics.keys() & self._names.keys():
             self._collection.clear()
 
     async def _on_smooth(self, request, response):

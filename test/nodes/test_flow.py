@@ -1,17 +1,15 @@
 """Sessions between nodes of this process; see imu_fusion/nodes/flow."""
 
-import time
-
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64, String
 
-from imu_fusion.nodes.flow import END, NEXT, Flow, peers, reliable_qos, sensor_qos, sink, source
-from imu_fusion.nodes.flow.qos import gid
+from imu_fusion.nodes.flow import END, NEXT, Flow, peers, sensor_qos, sink, source
+from imu_fusion.nodes.flow.qos import gid, session_qos
 from imu_fusion.nodes.flow.source import WINDOW
-from imu_fusion.nodes.flow.state import MARK, STATE_QOS, Sending, Sent, State
+from imu_fusion.nodes.flow.state import BEGIN, MARK, STATE_QOS, Sending, Sent, State
 
 
 def value(cdr):
@@ -59,6 +57,7 @@ class Receiver(Part):
     def __init__(self, graph, name="receiver", topic="/numbers", qos=None, **options):
         super().__init__(graph, name, **options)
         self.values, self.ended, self.over, self.takes = [], [], [], True
+        self.flow.sink.gate.can_execute = lambda entity: self.takes
         self.input = self.flow.input(Int64, topic, qos)
 
     def work(self):
@@ -70,14 +69,6 @@ class Receiver(Part):
             self.ended += [session.event for session in turn.over]
             self.flow.finish(turn)
         return super().work()
-
-
-class Idle(Receiver):
-    """Joins and then takes nothing: the executor must not take for it either."""
-
-    def __init__(self, graph, *args, **options):
-        super().__init__(graph, *args, **options)
-        self.flow.sink.gate.can_execute = lambda entity: self.takes
 
 
 class Doubler(Part):
@@ -112,10 +103,6 @@ def twice(count):
     return [i for i in range(count) for _ in range(2)] + [999_999]
 
 
-def drained(*senders):
-    return lambda: all(s.source.drained() for s in senders)
-
-
 def test_more_than_any_queue_holds_arrives_complete_and_in_order(graph):
     receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
     sender.session(20_000)
@@ -123,3 +110,435 @@ def test_more_than_any_queue_holds_arrives_complete_and_in_order(graph):
     assert receiver.values == list(range(20_000))
     assert sender.source.report() == {"/numbers": (20_000, {"/receiver": 0})}
     assert not receiver.flow.problems and not sender.flow.problems
+
+
+def test_sender_stops_while_a_sink_takes_nothing(graph):
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    receiver.takes = False
+    sender.session(9000)
+    graph.until(lambda: sender.out.sent > 1000 and not sender.out.is_open())
+    assert sender.out.sent <= 5000 + WINDOW  # what a queue of Fast DDS holds, and the window
+    assert "/receiver" in sender.source.waiting_for()
+    receiver.takes = True
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == list(range(9000))
+
+
+def test_back_pressure_and_end_pass_through_processing_nodes(graph):
+    receiver, doubler = Receiver(graph, topic="/doubled"), Doubler(graph)
+    sender = Sender(graph, wait_for=["doubler", "receiver"])
+    receiver.takes = False
+    sender.session(12_000)
+    graph.until(lambda: not sender.out.is_open() and doubler.out.waiting and sender.out.sent)
+    assert sender.out.sent < 12_000
+    receiver.takes = True
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == twice(12_000)
+    assert doubler.ended == ["/numbers"] and doubler.finishes == 1
+    assert doubler.most <= 2 * sink.AT_ONCE + 1  # what one turn makes waits, and no more
+
+
+def test_a_chain_of_processing_nodes_is_ready_and_ends_as_one(graph):
+    receiver = Receiver(graph, topic="/twice")
+    sender = Sender(graph, wait_for=["first", "second"])
+    graph.until(lambda: sender.flow.peers)
+    sender.session(3000)
+    graph.until(lambda: "/first" in sender.source.waiting_for())
+    first, second = Doubler(graph, "first"), Doubler(graph, "second", ("/doubled",), "/twice")
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == [*[i for i in range(3000) for _ in range(4)], *3 * [999_999]]
+    assert first.finishes == second.finishes == 1
+    for part in (receiver, first, second, sender):
+        assert not part.flow.problems
+
+
+def test_node_between_ends_only_when_all_its_sources_have_ended(graph):
+    receiver = Receiver(graph, topic="/doubled")
+    doubler = Doubler(graph, inputs=("/a", "/b"))
+    a = Sender(graph, "a", "/a", wait_for=["doubler"])
+    b = Sender(graph, "b", "/b", wait_for=["doubler"])
+    b.session(5, event=None)
+    graph.until(lambda: b.out.sent == 5)
+    a.session(10)
+    graph.until(lambda: doubler.ended == ["/a"])
+    b.source.end(END)
+    graph.until(lambda: receiver.ended)
+    assert doubler.ended == ["/a", "/b"] and doubler.finishes == 1
+    assert doubler.begun == [["/b"], ["/a", "/b"]]
+    assert len(receiver.values) == 2 * 15 + 1
+    graph.until(lambda: a.source.drained() and b.source.drained())
+
+
+def test_next_session_resets_and_its_messages_do_not_mix_with_the_last(graph):
+    receiver, doubler = Receiver(graph, topic="/doubled"), Doubler(graph)
+    sender = Sender(graph, wait_for=["doubler", "receiver"])
+    sender.session(300, event=NEXT)
+    graph.until(sender.source.drained)
+    sender.session(200)
+    graph.until(lambda: len(receiver.ended) == 2)
+    assert receiver.values == twice(300) + twice(200)
+    assert receiver.ended == [NEXT, END]
+    assert doubler.begun == [["/numbers"], ["/numbers"]] and doubler.finishes == 2
+
+
+def test_short_sessions_one_after_the_other_with_new_receivers_lose_nothing(graph):
+    """The processing node lives on; names of receivers and senders come back each time."""
+    doubler = Doubler(graph)
+    for count in (30, 1, 200, 0, 3000, 7):
+        receiver = Receiver(graph, topic="/doubled")
+        sender = Sender(graph, wait_for=["receiver", "doubler"])
+        sender.session(count)
+        graph.until(lambda: receiver.ended and sender.source.drained())
+        assert receiver.values == twice(count)
+        assert not receiver.flow.problems and not sender.flow.problems
+        for part in (receiver, sender):
+            part.flow.close()
+            graph.remove(part.node)
+    assert not doubler.flow.problems
+
+
+def test_late_joiner_gets_everything_from_where_it_joined(graph):
+    early = Receiver(graph, "early")
+    sender = Sender(graph, wait_for=["early"])
+    sender.session(30_000)
+    graph.until(lambda: len(early.values) > 5000)
+    late = Receiver(graph, "late", qos=sensor_qos())
+    graph.until(lambda: early.ended and late.ended)
+    assert early.values == list(range(30_000))
+    missed = late.input.missed
+    assert 0 < missed < 30_000
+    assert late.values[-(30_000 - missed):] == list(range(missed, 30_000))
+    assert not late.flow.problems and not late.input.lost
+
+
+def test_node_between_that_joins_late_says_what_is_not_in_its_session(graph):
+    """Its receivers hear of it: what they have is made of incomplete data."""
+    early, receiver = Receiver(graph, "early"), Receiver(graph, topic="/doubled")
+    sender = Sender(graph, wait_for=["early"])
+    sender.session(30_000)
+    graph.until(lambda: len(early.values) > 5000)
+    doubler = Doubler(graph)
+    graph.until(lambda: receiver.ended)
+    missed, = (int(text.split(": ")[1].split()[0]) for text in doubler.flow.problems)
+    assert 0 < missed < 30_000  # what it heard before it had joined is not of its session
+    assert receiver.values[-2 * (30_000 - missed) - 1:] == [
+        i for i in twice(30_000) if i >= missed]
+    assert receiver.flow.problems == [
+        f"/doubler made its messages of incomplete data: it lacks {missed} messages"]
+
+
+def test_vanished_consumer_is_named_and_does_not_block_the_others(graph):
+    gone, stays = Receiver(graph, "gone"), Receiver(graph, "stays")
+    sender = Sender(graph, wait_for=["gone", "stays"])
+    sender.session(10_000)
+    graph.until(lambda: len(gone.values) > 10)
+    gone.takes = False
+    graph.until(lambda: not sender.out.is_open())
+    graph.remove(gone.node)
+    graph.until(lambda: stays.ended)
+    assert stays.values == list(range(10_000))
+    assert sender.flow.problems == ["/gone has vanished in mid-session"]
+
+
+def test_restarted_under_its_name_it_is_somebody_else(graph):
+    stays = Receiver(graph, "stays")
+    first = Receiver(graph, "receiver")
+    sender = Sender(graph, wait_for=["receiver", "stays"])
+    sender.session(60_000)
+    graph.until(lambda: len(first.values) > 10)
+    first.flow.close()  # an orderly end: nobody minds
+    graph.remove(first.node)
+    again = Receiver(graph, "receiver")
+    graph.until(lambda: stays.ended and again.ended)
+    assert stays.values == list(range(60_000))
+    assert again.values[-1] == 59_999 and again.input.missed + len(again.values) >= 60_000
+    for part in (sender, stays, again):
+        assert not part.flow.problems
+
+
+def test_two_sinks_of_one_name_get_everything(graph):
+    one, two = Receiver(graph), Receiver(graph)
+    sender = Sender(graph, wait_for=["receiver"])
+    graph.until(lambda: len(sender.flow.peers) == 2)
+    sender.session(8000)
+    graph.until(lambda: one.ended and two.ended and sender.source.drained())
+    assert one.values == two.values == list(range(8000))
+
+
+def test_sink_does_not_wait_for_a_source_that_has_vanished(graph):
+    receiver = Receiver(graph)
+    sender = Sender(graph, wait_for=["receiver"])
+    sender.session(5, event=None)
+    graph.until(lambda: len(receiver.values) == 5)
+    graph.remove(sender.node)
+    graph.until(lambda: receiver.ended)
+    assert not receiver.flow.sink.feeding()
+    assert receiver.flow.problems == ["the session of /sender broke off: it has vanished"]
+
+
+def test_foreign_subscriber_is_named_and_never_waited_for(graph):
+    stranger = graph.node("stranger")
+    stranger.create_subscription(Int64, "/numbers", lambda m: None, 10)
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    graph.until(lambda: sender.out.matched() == 2)
+    sender.session(2000)
+    graph.until(lambda: receiver.ended)
+    assert sender.source.foreign == {"/numbers": ["/stranger"]}
+    assert receiver.values == list(range(2000))
+
+
+def test_foreign_subscriber_that_takes_nothing_does_not_stop_a_session(graph):
+    """Its queue is full after 5000 messages; then it acknowledges no more, for ever."""
+    stranger = rclpy.create_node("stranger")  # no executor: it never takes
+    stranger.create_subscription(Int64, "/numbers", lambda m: None, session_qos())
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    graph.until(lambda: sender.out.matched() == 2)
+    sender.session(7000)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == list(range(7000))
+    assert not sender.flow.problems and not receiver.flow.problems
+    stranger.destroy_node()
+
+
+def test_second_publisher_is_named_counted_and_stops_nothing(graph, capfd):
+    driver = graph.node("driver")
+    other = driver.create_publisher(Int64, "/numbers", 10)
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    graph.until(lambda: other.get_subscription_count() == 1)
+    sender.session(20_000)
+    graph.until(lambda: len(receiver.values) > 100)
+    graph.until(lambda: other.get_subscription_count() == 1)
+    for i in range(5):
+        other.publish(Int64(data=-1 - i))
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert [v for v in receiver.values if v >= 0] == list(range(20_000))
+    assert [v for v in receiver.values if v < 0] == [-1, -2, -3, -4, -5]
+    assert receiver.input.unexpected == 5 and not receiver.input.lost
+    problem, = receiver.flow.problems
+    assert "5 messages more than the 20000" in problem
+    assert "driver publishes /numbers beside /sender" in capfd.readouterr().err
+
+
+def test_without_a_session_messages_flow_unacknowledged(graph):
+    receiver, sender = Receiver(graph), Sender(graph)
+    graph.until(lambda: sender.out.matched() == 1)
+    for i in range(10):
+        assert sender.source.ready()
+        sender.out.publish(Int64(data=i))
+    graph.until(lambda: len(receiver.values) == 10)
+    assert not receiver.input.sessions
+
+
+def test_loss_is_counted_and_the_session_still_ends(graph, monkeypatch):
+    """A lossy link: the receiver is handed every third message only."""
+    monkeypatch.setattr(sink, "SILENCE", 0.5)
+    receiver = Receiver(graph)
+    sender = Sender(graph, wait_for=["receiver"])
+    take, handed = receiver.input.take, [0]
+
+    def lossy():
+        messages = take()
+        first = -handed[0] % 3
+        handed[0] += len(messages)
+        return messages[first::3]
+
+    receiver.input.take = lossy
+    sender.session(99)
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == list(range(0, 99, 3))
+    assert receiver.input.lost == 66
+    assert receiver.flow.problems == ["/numbers: 66 of 99 messages LOST"]
+    graph.until(sender.source.drained)
+    assert sender.source.report()["/numbers"] == (99, {"/receiver": 66})
+    assert sender.flow.problems == ["/receiver lost 66 of /numbers"]
+
+
+def test_sink_that_takes_nothing_answers_and_is_not_waited_for_at_the_end(graph):
+    Receiver(graph, "idle", "/other")
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver", "idle"])
+    sender.session(10)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert sender.source.report() == {"/numbers": (10, {"/receiver": 0})}
+
+
+def test_remapped_names_are_those_of_the_graph(graph):
+    """Both ends speak of resolved names: a remapped sink is known to take the topic."""
+    node = graph.add(rclpy.create_node("remapped", cli_args=[
+        "--ros-args", "-r", "/private:=/numbers", "-r", "__ns:=/deep"]))
+    graph.node = lambda name: node
+    remapped = Receiver(graph, topic="/private")
+    del graph.node
+    sender = Sender(graph, wait_for=["/deep/remapped"])
+    sender.session(10)
+    graph.until(sender.source.drained)
+    assert remapped.input.topic == "/numbers" and len(remapped.values) == 10
+    assert sender.source.report() == {"/numbers": (10, {"/deep/remapped": 0})}
+
+
+def test_node_between_waits_for_sinks_that_only_its_source_has_discovered(graph):
+    """Discovery between each two nodes takes its own time. Here the doubler cannot see the
+    receiver, and the receiver not the doubler, until they may."""
+    receiver, doubler = Receiver(graph, topic="/doubled"), Doubler(graph)
+    hidden = [True]
+    for one, other in ((doubler, "/receiver"), (receiver, "/doubler")):
+        names = one.node.get_topic_names_and_types
+        one.node.get_topic_names_and_types = lambda names=names, other=other: [
+            (topic, types) for topic, types in names()
+            if not (hidden[0] and topic.startswith(other + MARK))]
+    sender = Sender(graph, wait_for=["doubler", "receiver"])
+    sender.session(100)
+    graph.until(lambda: "/receiver" in doubler.flow.source.waiting_for())
+    graph.until(lambda: "/doubler" in sender.source.waiting_for())
+    assert sender.out.sent == 0
+    hidden[0] = False
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == twice(100)
+    assert receiver.input.missed == 0 and not receiver.flow.problems
+
+
+def test_best_effort_sink_listens_reliably_during_a_session_and_only_then(graph):
+    """A driver that offers best effort is heard before and after; a replay loses nothing."""
+    receiver = Receiver(graph, qos=sensor_qos())
+    driver = graph.node("driver").create_publisher(
+        Int64, "/numbers", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Int64(data=-1))
+    graph.until(lambda: receiver.values == [-1])
+    sender = Sender(graph, wait_for=["receiver"])
+    sender.session(20_000)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == [-1, *range(20_000)]
+    assert receiver.input.lost == receiver.input.missed == 0
+    graph.until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Int64(data=-2))
+    graph.until(lambda: receiver.values[-1] == -2)
+
+
+def test_best_effort_sink_hears_a_loop_without_gaps(graph):
+    receiver = Receiver(graph, qos=sensor_qos())
+    sender = Sender(graph, wait_for=["receiver"])
+    for event in (NEXT, NEXT, END):
+        sender.session(300, event=event)
+        graph.until(sender.source.drained)
+    assert receiver.values == 3 * list(range(300)) and receiver.ended == [NEXT, NEXT, END]
+
+
+def test_large_messages_are_bounded_by_their_bytes(graph, monkeypatch):
+    """Acknowledged is not taken: 5000 messages of a megabyte would fill the memory."""
+    monkeypatch.setattr(source, "WINDOW_BYTES", 1e5)
+    monkeypatch.setattr(source, "QUEUED_BYTES", 5e5)
+    receiver = Part(graph, "receiver")
+    taken = receiver.flow.input(String, "/texts")
+    sender = Sender(graph, topic="/numbers", wait_for=["receiver"])
+    out = sender.flow.output(String, "/texts")
+    message = b"\0\1\0\0" + (10_001).to_bytes(4, "little") + 10_000 * b"x" + b"\0"
+    sender.source.begin()
+    graph.until(out.is_open)
+    for _ in range(200):
+        out.publish(message)
+    graph.until(lambda: not out.is_open())
+    assert out.bytes <= 5e5 + 1.1e5 and out.waiting
+    count = [0]
+
+    def work():
+        sender.flow.send()
+        turn = receiver.flow.take()
+        count[0] += len(turn.blocks.get("/texts", ()))
+        receiver.flow.finish(turn)
+        return 0.01
+
+    receiver.node.work = work
+    graph.until(lambda: count[0] == 200)
+    assert taken.count == 200 and not out.waiting
+
+
+def statement(instance, gid_of, topic="/numbers", event=BEGIN, session="forged"):
+    """What a forger says of a session."""
+    return State(True, Sending(session, event, {topic: Sent("std_msgs/msg/Int64", gid_of, 0, 0)},
+                               frozenset()), {}).message()
+
+
+@pytest.mark.parametrize("message", [
+    DiagnosticArray(),
+    DiagnosticArray(status=[DiagnosticStatus(name="sends", message="begin")]),
+    DiagnosticArray(status=[DiagnosticStatus(name="x")]),
+])
+def test_malformed_states_are_ignored_with_a_warning(graph, monkeypatch, capfd, message):
+    """Of a stranger; the session begins without him after a while."""
+    monkeypatch.setattr(peers, "PATIENCE", 0.5)
+    stranger = graph.node("stranger")
+    stranger.create_publisher(DiagnosticArray, f"/stranger{MARK}i1", STATE_QOS).publish(message)
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    graph.until(lambda: f"/stranger{MARK}i1" in sender.flow.peers)
+    sender.session(10)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == list(range(10))
+    assert not receiver.flow.problems and not sender.flow.problems
+    assert f"/stranger{MARK}i1 is ignored" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["x", "1 2 3", "a b -1 0", "t w 1.5 0", ""])
+def test_malformed_fields_are_no_state(text):
+    message = State(True, Sending("s", BEGIN, {}, frozenset()), {}).message()
+    message.status[0].values[0].key = "topic /x"
+    message.status[0].values[0].value = text
+    with pytest.raises(ValueError, match="malformed"):
+        State.of(message)
+
+
+def test_who_does_not_publish_the_data_is_not_believed(graph, monkeypatch, capfd):
+    """A session of data of somebody else, and of nobody."""
+    monkeypatch.setattr(peers, "PATIENCE", 0.5)
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    forger = graph.node("forger")
+    for i, writer in enumerate((sender.out.writer, 32 * "0")):
+        instance = f"/forger{MARK}i{i}"
+        forger.create_publisher(DiagnosticArray, instance, STATE_QOS).publish(
+            statement(instance, writer))
+    graph.until(lambda: sum(name.startswith("/forger") for name in sender.flow.peers) == 2)
+    sender.session(1000)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == list(range(1000)) and len(receiver.ended) == 1
+    assert not receiver.flow.problems
+    assert "is ignored: does not publish /numbers" in capfd.readouterr().err
+
+
+def test_forged_end_ends_nothing(graph, monkeypatch):
+    """Somebody writes on the topic of the sender: while there are two, neither is believed."""
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    sender.session(30_000)
+    graph.until(lambda: len(receiver.values) > 100)
+    instance = sender.source._own
+    forger = graph.node("forger")
+    said = sender.source.sending()
+    forger.create_publisher(DiagnosticArray, instance, STATE_QOS).publish(statement(
+        instance, sender.out.writer, event=END, session=said.session))
+    peer = receiver.flow.peers[instance]
+    graph.until(lambda: peer.doubted is not None and sender.out.sent == 30_000)
+    assert not receiver.ended
+    graph.remove(forger)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.values == list(range(30_000))
+    assert not receiver.flow.problems
+
+
+def test_two_that_say_who_they_are_are_given_up_after_a_while(graph, monkeypatch):
+    monkeypatch.setattr(peers, "PATIENCE", 0.5)
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    sender.session(100, event=None)
+    graph.until(lambda: len(receiver.values) == 100)
+    instance = sender.source._own
+    graph.node("forger").create_publisher(DiagnosticArray, instance, STATE_QOS)
+    graph.until(lambda: receiver.ended)
+    assert receiver.flow.problems == [
+        f"two publishers of {instance}: neither is believed",
+        "the session of /sender broke off: it has vanished"]
+
+
+def test_the_state_of_another_is_said_by_its_own_writer(graph):
+    sender, receiver = Sender(graph), Receiver(graph)
+    graph.until(lambda: receiver.flow.peers and sender.flow.peers)
+    instance = sender.source._own
+    info, = receiver.node.get_publishers_info_by_topic(instance)
+    graph.until(lambda: receiver.flow.peers[instance].state is not None)
+    assert receiver.flow.peers[instance].writer == gid(info)

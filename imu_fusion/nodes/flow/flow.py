@@ -1,5 +1,6 @@
 """A node's part in sessions, as taker, sender or both: :class:`Flow`."""
 
+import time
 import uuid
 from collections.abc import Callable, Collection
 
@@ -10,10 +11,11 @@ from rclpy.qos import QoSProfile
 from imu_fusion.nodes.flow.peers import Peers
 from imu_fusion.nodes.flow.qos import PARTICIPANT, made, steady_timer
 from imu_fusion.nodes.flow.sink import Input, Session, Sink, Turn
-from imu_fusion.nodes.flow.source import Output, Source
+from imu_fusion.nodes.flow.source import AT_ONCE, Output, Source
 from imu_fusion.nodes.flow.state import END, MARK, STATE_QOS, State
 
 _LOOK_EVERY = 0.1  # s
+_LAST_WORDS = 0.5  # s
 _POLL = 0.002  # s, between looks whether all is acknowledged
 
 
@@ -52,7 +54,8 @@ class Flow:
             upstream=lambda: self.sink.company() if relays else set(), problem=self._problem)
         self.sink = Sink(
             node, self.peers, own, gid[:PARTICIPANT], hold=hold, on_begin=on_begin,
-            on_join=self._join, gate=lambda: not relays or self.source.ready(), say=self._say,
+            on_join=self._join, gate=lambda: not relays or self.source.ready(),
+            may_answer=lambda: not relays or self.source.is_settled(), say=self._say,
             problem=self._problem)
         self._said: State | None = None
         self._say()
@@ -96,9 +99,12 @@ class Flow:
         return min(idle, _POLL) if self.source.is_shut() else idle
 
     def close(self) -> None:
-        """The node stops: whoever listens is told that nothing more comes."""
+        """The node stops: whoever listens is told that nothing more comes, and time to hear it."""
         self.source.end(END)
         self.sink.leave()
+        deadline = time.monotonic() + _LAST_WORDS
+        while not self._publisher.wait_for_all_acked(AT_ONCE) and time.monotonic() < deadline:
+            time.sleep(_POLL)
 
     def _join(self):
         if self._relays:

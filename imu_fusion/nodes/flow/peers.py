@@ -2,6 +2,8 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
@@ -25,7 +27,7 @@ class Peer:
         self.subscription = None
         self.since = time.monotonic()
         self.doubted: float | None = None  # since when there are two writers
-        self.complained = False
+        self.complained = self.is_gone = False
 
     @property
     def is_silent(self) -> bool:
@@ -57,7 +59,8 @@ class Peers(dict[str, Peer]):
                 peer = self[topic] = Peer(topic)
                 self._listen(peer)
         for peer in list(self.values()):
-            self._examine(peer)
+            if not peer.is_gone:  # what changes may call look, too
+                self._examine(peer)
 
     def _writers(self, topic):
         return {gid(info) for info in self._node.get_publishers_info_by_topic(topic)}
@@ -69,6 +72,17 @@ class Peers(dict[str, Peer]):
             DiagnosticArray, peer.instance, lambda message: self._hear(peer, message), STATE_QOS)
 
     def _forget(self, peer):
+        """It has gone: hear its last words first."""
+        peer.is_gone = True
+        if peer.state is not None and peer.doubted is None:
+            last, handle = peer.heard, peer.subscription.handle
+            with handle:
+                while (taken := handle.take_message(DiagnosticArray, False)) is not None:
+                    with suppress(ValueError):
+                        last = State.of(taken[0])
+            if last is not None:
+                peer.state = replace(peer.state, joined=last.joined)
+            self._changed()
         self._node.destroy_subscription(peer.subscription)
         del self[peer.instance]
         self._changed()
@@ -95,7 +109,7 @@ class Peers(dict[str, Peer]):
             self._complain(peer, "says nothing that can be believed")
 
     def _hear(self, peer, message):
-        if self.get(peer.instance) is not peer:
+        if peer.is_gone:
             return
         if peer.heard is None:
             peer.heard_at = time.monotonic()

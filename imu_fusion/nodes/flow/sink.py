@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 
 from imu_fusion.nodes.flow.peers import Peer, Peers
 from imu_fusion.nodes.flow.qos import made, reliable_qos, session_qos
@@ -32,6 +32,7 @@ class Session:
     said: Sending
     topics: dict[str, int]  # those taken -> count of the writer when we joined
     late: int = 0  # messages before that
+    answered: bool = False
     broken: bool = False
     finished: bool = False
 
@@ -82,6 +83,7 @@ class Input:
         self.msg_type, self.topic, self.qos = msg_type, topic, qos
         self.reader = ""
         self.subscription = None
+        self.in_session = False  # whether it reads as in one
         self.lost = self.unexpected = self.missed = 0  # missed: sent before we joined
         self.sessions: list[Session] = []  # until all of them have ended
         self.count = 0  # taken in them
@@ -89,16 +91,12 @@ class Input:
         self.is_empty = False
         self._first: list[Message] = []  # taken by the executor
         self._sink = sink
-        self.listen(qos)
+        self.listen(False)
 
-    @property
-    def in_session(self) -> bool:
-        """Whether it reads as in a session."""
-        return self.subscription.qos_profile.history == HistoryPolicy.KEEP_ALL
-
-    def listen(self, qos: QoSProfile) -> None:
+    def listen(self, in_session: bool) -> None:
         """Subscribe anew."""
-        node = self._sink.node
+        node, qos = self._sink.node, session_qos() if in_session else self.qos
+        self.in_session = in_session
         if self.subscription is not None:
             node.destroy_subscription(self.subscription)
         self.subscription, self.reader = made(
@@ -145,13 +143,14 @@ class Sink:
     Args:
         hold: while it returns true, no session is joined.
         gate: while it returns false, nothing is taken.
+        may_answer: while it returns false, sessions that are joined are not answered.
         on_begin: called with the :class:`Session` that is about to be joined; may add inputs.
         on_join: called when topics of a session are taken, before that is said.
         say, problem: as of a source.
     """
 
     def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
-                 hold: Callable[[], bool], gate: Callable[[], bool],
+                 hold: Callable[[], bool], gate: Callable[[], bool], may_answer: Callable[[], bool],
                  on_begin: Callable[[Session], None], on_join: Callable[[], None], say: Callable[[], None],
                  problem: Callable[[str], None]) -> None:
         self.node, self.participant = node, participant
@@ -159,6 +158,7 @@ class Sink:
         self.sessions: dict[str, Session] = {}  # by instance of the sender
         self.gate = _Gate(gate)
         self.woken = False
+        self._may_answer = may_answer
         self._peers, self._own = peers, own
         self._hold, self._on_begin, self._on_join = hold, on_begin, on_join
         self._say, self._problem = say, problem
@@ -183,11 +183,18 @@ class Sink:
         return {i for s in self.feeding() for i in s.said.company} - {self._own}
 
     def joined(self) -> Mapping[str, Joined]:
-        """What is said of the sessions."""
+        """What is said of the sessions.
+
+        One that feeds what this node sends is answered when that may be sent: its sender begins
+        when all behind this node are ready, too.
+        """
+        for session in self.sessions.values():
+            session.answered |= not session.topics or self._may_answer()
         return {s.instance: Joined(s.id, s.finished, {
             topic: Taken(self.inputs[topic].reader, base + self._reported.get(topic, 0),
                          self.inputs[topic].lost)
-            for topic, base in s.topics.items()}) for s in self.sessions.values()}
+            for topic, base in s.topics.items()})
+            for s in self.sessions.values() if s.answered}
 
     def follow(self) -> None:
         """Join, and hear how sessions end."""
@@ -203,7 +210,7 @@ class Sink:
         for topic_input in self.inputs.values():
             if (topic_input.in_session and not topic_input.sessions
                     and not self.promised(topic_input.topic)):
-                topic_input.listen(topic_input.qos)
+                topic_input.listen(False)
         self._close_idle()
 
     def promised(self, topic: str | None = None) -> bool:
@@ -282,7 +289,7 @@ class Sink:
             topic_input = self.inputs[topic]
             if not topic_input.in_session:
                 topic_input.take()
-                topic_input.listen(session_qos())
+                topic_input.listen(True)
             if not topic_input.sessions:
                 topic_input.count = 0
                 self._reported.pop(topic, None)

@@ -17,7 +17,9 @@ WINDOW = 500  # messages sent before all must be acknowledged; half the depth of
 WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
-_AT_ONCE = Duration(nanoseconds=0)
+GETTING_KNOWN = 0.5  # s, in which a new subscriber may turn out to be one of our nodes
+
+AT_ONCE = Duration(nanoseconds=0)
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
 
@@ -67,7 +69,7 @@ class Output:
 
     def acknowledged(self) -> bool:
         """Whether everything is in the queue of each reader, or was taken by all of ours."""
-        if self._publisher.wait_for_all_acked(_AT_ONCE):
+        if self._publisher.wait_for_all_acked(AT_ONCE):
             return True
         taken = self._source.taken(self.topic)
         return taken is not None and taken >= self.sent
@@ -110,6 +112,7 @@ class Source:
         self.phase = _LIVE
         self.lost = 0  # see Sending
         self.foreign: dict[str, list[str]] = {}
+        self._foreign_since: dict[str, float] = {}
         self._peers, self._own = peers, own
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
         self._upstream, self._say, self._problem = upstream, say, problem
@@ -144,6 +147,7 @@ class Source:
         for output in self.outputs.values():
             output.start = output.sent
         self.phase = _JOINING
+        self._peers.look()
         self.look(anew=True)
 
     def end(self, event: str = END) -> None:
@@ -156,6 +160,10 @@ class Source:
         """Whether every topic may send (always, without a session)."""
         return not self._begin_after and all(
             not output.waiting and output.is_open() for output in self.outputs.values())
+
+    def is_settled(self) -> bool:
+        """Whether a session is open which all have joined."""
+        return self.phase == _OPEN and not self._begin_after
 
     def is_shut(self) -> bool:
         """Whether something waits for acknowledgements, whose coming wakes nobody."""
@@ -199,6 +207,8 @@ class Source:
     def look(self, anew: bool = False) -> None:
         """Compare with the graph: who listens, who has come, who has gone."""
         self.foreign = self._strangers()
+        names = {name for names in self.foreign.values() for name in names}
+        self._foreign_since = {n: self._foreign_since.get(n, time.monotonic()) for n in names}
         if self.phase in (_JOINING, _OPEN):
             known = self._upstream() | {
                 p.instance for p in self._peers.values() if p.state and p.state.listens}
@@ -225,8 +235,9 @@ class Source:
         for instance, joined in self._answers().items():
             if joined is not None:
                 self._takers[instance] = self._peers[instance].name, joined
-        if self.phase == _JOINING and self._is_settled():
+        if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
+            self._say()
         if self.phase == _OPEN:
             for output in self.outputs.values():
                 output.drain()
@@ -244,6 +255,8 @@ class Source:
             lost = {topic: taken.lost for topic, taken in joined.topics.items() if taken.lost}
             if lost:
                 self._problem(f"{name} lost " + ", ".join(f"{n} of {t}" for t, n in lost.items()))
+        for output in self.outputs.values():
+            output.drain()
         if self._begin_after:
             self.begin()
 
@@ -259,11 +272,13 @@ class Source:
     def _names(self):
         return {self._peers[i].name for i, j in self._answers().items() if j is not None}
 
-    def _is_settled(self):
+    def _all_joined(self):
         """All have answered, and the readers that they speak of are matched."""
         answers = self._answers().values()
         if (None in answers or self._wait_for - self._names()
-                or any(peer.is_silent for peer in self._peers.values())):
+                or any(peer.is_silent for peer in self._peers.values())
+                or any(time.monotonic() - since < GETTING_KNOWN
+                       for since in self._foreign_since.values())):
             return False
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
