@@ -13,7 +13,7 @@ from sensor_msgs.msg import Imu
 from imu_fusion.kernels import NOTICE
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.nodes import processes
-from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
+from imu_fusion.nodes.flow import END, Flow
 from imu_fusion.nodes.pipeline import run_pipeline
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
@@ -52,21 +52,23 @@ def test_replay_through_processes_ends_by_itself_and_says_what_it_sent(bag, tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_closes_the_recording_with_all_that_was_acknowledged(graph, tmp_path, number):
+def test_signal_closes_the_recording_with_all_that_was_taken(graph, tmp_path, number):
     out = tmp_path / "out"
     recorder = start("recorder", out=out, topics="[/imu/data_raw]")
-    source = FlowSource(graph.node("talker"), wait_for=["recorder"])
-    publisher = source.publisher(Imu, "/imu/data_raw")
-    source.begin()
-    graph.until(source.ready)
-    for i in range(2 * ACK_EVERY):
-        publisher.publish(imu_message(START + i * STEP, "imu_link", (0, 0, 0), (i, 0, 0)))
-    graph.until(lambda: source.acknowledged("/imu/data_raw") == 2 * ACK_EVERY)
+    flow = Flow(graph.node("talker"), listens=False, wait_for=["recorder"])
+    output = flow.output(Imu, "/imu/data_raw")
+    flow.source.begin()
+    graph.until(flow.source.is_settled)
+    for i in range(250):
+        output.publish(imu_message(START + i * STEP, "imu_link", (0, 0, 0), (i, 0, 0)))
+    graph.until(lambda: flow.source.taken("/imu/data_raw") == 250)
     recorder.send_signal(number)
     code, said = end(recorder)
     assert code == 0 and "Traceback" not in said, said
     with open_bag(out) as reader:
-        assert not reader.warnings and reader.topics["/imu/data_raw"].count == 2 * ACK_EVERY
+        assert not reader.warnings and reader.topics["/imu/data_raw"].count == 250
+    graph.until(lambda: not flow.peers)  # it has said good-bye
+    assert not flow.problems
 
 
 def test_signal_to_the_replayer_ends_its_session(graph, bag):
@@ -136,9 +138,11 @@ def test_kernels_are_compiled_before_any_node_starts(tmp_path, monkeypatch, caps
     assert not started and capsys.readouterr().err == "compiling for this machine\n"
 
 
-def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, monkeypatch, capsys):
-    """A recorder without a session never ends; asked to, it closes its recording. What nodes say
-    into their logs while they compile is passed on."""
+
+
+def test_a_node_closes_its_files_when_asked_to_end(tmp_path, monkeypatch, capsys):
+    """A recorder without a session never ends by itself. What nodes say into their logs while
+    they compile is passed on."""
     monkeypatch.setattr(processes, "compile_ahead", lambda say: None)
     with NodeProcesses(tmp_path / "logs") as nodes:
         nodes.start("recorder", out=str(tmp_path / "bag"))
@@ -148,6 +152,7 @@ def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, monkeypatch, c
             time.sleep(0.05)
         with open(tmp_path / "logs" / "recorder.log", "a") as log:
             log.write(f"[INFO] [recorder]: {NOTICE}\n")
-        assert nodes.finish("recorder", 0.5) is False
+        nodes.process("recorder").send_signal(signal.SIGINT)
+        nodes.wait("recorder", 15.0)
     assert capsys.readouterr().err == NOTICE + "\n"
     assert (tmp_path / "bag" / "metadata.yaml").exists()
