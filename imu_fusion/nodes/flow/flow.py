@@ -16,7 +16,7 @@ from imu_fusion.nodes.flow.state import END, MARK, STATE_QOS, State
 
 _LOOK_EVERY = 0.1  # s
 _LAST_WORDS = 0.5  # s
-_POLL = 0.002  # s, between looks whether all is acknowledged
+_POLL, _POLL_AT_MOST = 0.002, 0.016  # s, between looks whether all is acknowledged
 
 
 class Flow:
@@ -58,6 +58,7 @@ class Flow:
             may_answer=lambda: not relays or self.source.is_settled(), say=self._say,
             problem=self._problem)
         self._said: State | None = None
+        self._poll = _POLL
         self._say()
         steady_timer(node, _LOOK_EVERY, self._look)
 
@@ -96,7 +97,11 @@ class Flow:
         if any(not i.is_empty for i in self.sink.inputs.values() if i.sessions) and (
                 not self._relays or self.source.ready()):
             return 0.0
-        return min(idle, _POLL) if self.source.is_shut() else idle
+        if not self.source.is_shut():
+            self._poll = _POLL
+            return idle
+        self._poll = min(2.0 * self._poll, _POLL_AT_MOST)
+        return min(idle, self._poll)
 
     def close(self) -> None:
         """The node stops: whoever listens is told that nothing more comes, and time to hear it."""

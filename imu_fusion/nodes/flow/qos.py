@@ -1,11 +1,14 @@
 """QoS of data, timers of real time, and names of endpoints in the graph."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
+
+E = TypeVar("E")
 
 DEPTH = 1000  # queue depth of writers, and of readers outside sessions
 
@@ -51,8 +54,8 @@ def gid(info) -> str:
 PARTICIPANT = 24
 
 
-def made(infos: Callable[[str], list], topic: str, make: Callable[[], object],
-         participant: str = "") -> tuple[object, str]:
+def made(infos: Callable[[str], list], topic: str, make: Callable[[], E],
+         participant: str = "") -> tuple[E, str]:
     """Make an endpoint: (what ``make`` returned, its gid).
 
     rclpy does not tell the gid of what it has made. It is the one that is new in the graph.

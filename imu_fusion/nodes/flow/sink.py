@@ -81,8 +81,7 @@ class Input:
 
     def __init__(self, sink: "Sink", msg_type: type, topic: str, qos: QoSProfile) -> None:
         self.msg_type, self.topic, self.qos = msg_type, topic, qos
-        self.reader = ""
-        self.subscription = None
+        self.reader = ""  # its gid
         self.in_session = False  # whether it reads as in one
         self.lost = self.unexpected = self.missed = 0  # missed: sent before we joined
         self.sessions: list[Session] = []  # until all of them have ended
@@ -97,7 +96,7 @@ class Input:
         """Subscribe anew."""
         node, qos = self._sink.node, session_qos() if in_session else self.qos
         self.in_session = in_session
-        if self.subscription is not None:
+        if self.reader:
             node.destroy_subscription(self.subscription)
         self.subscription, self.reader = made(
             node.get_subscriptions_info_by_topic, self.topic,
@@ -133,7 +132,7 @@ class Input:
 
     def expected(self) -> int:
         """Messages that the sessions should bring; those of one that broke off are not known."""
-        return sum(s.said.topics[self.topic].count - s.topics[self.topic]
+        return sum(s.said.topics[self.topic].sent - s.topics[self.topic]
                    for s in self.sessions if not s.broken)
 
 
@@ -150,7 +149,8 @@ class Sink:
     """
 
     def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
-                 hold: Callable[[], bool], gate: Callable[[], bool], may_answer: Callable[[], bool],
+                 hold: Callable[[], bool], gate: Callable[[], bool],
+                 may_answer: Callable[[], bool],
                  on_begin: Callable[[Session], None], on_join: Callable[[], None], say: Callable[[], None],
                  problem: Callable[[str], None]) -> None:
         self.node, self.participant = node, participant
@@ -283,7 +283,7 @@ class Sink:
         session = Session(said.session, peer.instance, peer.name, said, {})
         session.topics = dict.fromkeys(said.topics, 0)
         self._on_begin(session)
-        session.topics = {t: said.topics[t].count for t in said.topics if t in self.inputs}
+        session.topics = {t: said.topics[t].sent for t in said.topics if t in self.inputs}
         self.sessions[peer.instance] = session
         for topic, count in session.topics.items():
             topic_input = self.inputs[topic]
@@ -295,7 +295,7 @@ class Sink:
                 self._reported.pop(topic, None)
             topic_input.sessions.append(session)
             topic_input.heard_at = time.monotonic()
-            late = count - said.topics[topic].start
+            late = count - said.topics[topic].before
             topic_input.missed += late
             session.late += late
             self._name_others(topic, peer)
@@ -338,8 +338,8 @@ class Sink:
             self._problem(f"{topic_input.topic}: {-surplus} of {expected} messages LOST")
         elif surplus > 0 and not broken:
             topic_input.unexpected += surplus
-            self._problem(f"{topic_input.topic}: {surplus} messages more than the {expected} of the "
-                          "session: somebody else publishes it, too")
+            self._problem(f"{topic_input.topic}: {surplus} messages more than the {expected} "
+                          "of the session: somebody else publishes it, too")
         return max(0, -surplus)
 
     def _close_idle(self):

@@ -7,11 +7,11 @@ from collections.abc import Callable, Collection
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
 from imu_fusion.nodes.flow.peers import Peers
 from imu_fusion.nodes.flow.qos import full_name, gid, made, reliable_qos, type_name
-from imu_fusion.nodes.flow.state import BEGIN, END, Joined, Sending, Sent, Taken
+from imu_fusion.nodes.flow.state import BEGIN, END, Joined, Sending, Sent
 
 WINDOW = 500  # messages sent before all must be acknowledged; half the depth of the queue
 WINDOW_BYTES = 16e6
@@ -31,13 +31,13 @@ class Output:
         self.topic = source.node.resolve_topic_name(name)
         self.waiting: deque = deque()
         self._source = source
-        self._publisher = None
+        self.writer = ""  # its gid
         self.renew(qos)
 
     def renew(self, qos: QoSProfile) -> None:
         """Begin anew, between sessions: what was latched is forgotten."""
         node = self._source.node
-        if self._publisher is not None:
+        if self.writer:
             node.destroy_publisher(self._publisher)
         self._publisher, self.writer = made(
             node.get_publishers_info_by_topic, self.topic,
@@ -175,7 +175,7 @@ class Source:
 
     def taken(self, topic: str) -> int | None:
         """How far all who joined have taken a topic; None: nobody takes it."""
-        return min((joined.topics[topic].count for joined in self._answers().values()
+        return min((joined.topics[topic].taken for joined in self._answers().values()
                     if joined is not None and topic in joined.topics and not joined.finished),
                    default=None)
 
@@ -198,7 +198,7 @@ class Source:
             return ""
         slow = sorted({self._peers[i].name for i, j in self._answers().items() if j is not None
                        and not j.finished and (self.phase == _ENDED or any(
-                           t in self.outputs and taken.count < self.outputs[t].sent
+                           t in self.outputs and taken.taken < self.outputs[t].sent
                            for t, taken in j.topics.items()))})
         slow += sorted({n for topic, names in self.foreign.items() for n in names
                         if not self.outputs[topic].is_open()})

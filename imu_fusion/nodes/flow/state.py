@@ -23,15 +23,15 @@ class Sent(NamedTuple):
 
     msgtype: str
     writer: str
-    start: int
-    count: int
+    before: int
+    sent: int
 
 
 class Taken(NamedTuple):
     """One topic that is taken: gid of the reader, how far of what its writer sent, what is lost."""
 
     reader: str
-    count: int
+    taken: int
     lost: int
 
 
@@ -115,9 +115,9 @@ def _count(text):
     return int(text)
 
 
-def _sent(msgtype, writer, start, count):
-    return Sent(msgtype, writer, _count(start), _count(count))
+def _sent(msgtype, writer, before, sent):
+    return Sent(msgtype, writer, _count(before), _count(sent))
 
 
-def _taken(reader, count, lost):
-    return Taken(reader, _count(count), _count(lost))
+def _taken(reader, taken, lost):
+    return Taken(reader, _count(taken), _count(lost))
