@@ -8,12 +8,22 @@ import sys
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.acceleration_field_cases import (METHODS, PARAMS, errors, fitted_densities, noisy,
-                                                 paper_sensors)
+from benchmarks.acceleration_field_cases import (
+    METHODS,
+    PARAMS,
+    errors,
+    fitted_densities,
+    noisy,
+    paper_sensors,
+)
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
-                                                     simulate)
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_PARTICLE,
+    PAPER_POSITIONS,
+    simulate,
+)
 
 BIAS_SDS_G = (0.05, 0.1)
 SIGMA = 10
@@ -27,7 +37,10 @@ def study(bias_sd_g, realisations):
     truth = motion.acceleration_world(PAPER_PARTICLE)
     turn = Rotation.from_quat(motion.quat).inv()
     rng = np.random.default_rng(5)
-    draw = lambda: rng.normal(0, bias_sd, (4, 3))
+
+    def draw():
+        return rng.normal(0, bias_sd, (4, 3))
+
     rigid = fitted_densities(PARAMS, paper_sensors(SIGMA, bias_sd), motion.stamp,
                              noisy(clean, SIGMA, rng) + draw())
     cases = {**METHODS, "smoother, readings without bias": METHODS["smoother"]}

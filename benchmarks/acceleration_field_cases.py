@@ -2,17 +2,20 @@
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
-                                                      AccelerationFieldParams)
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
 from imu_fusion.estimation.acceleration_field.rows import field_at
 from imu_fusion.simulation.noise import ornstein_uhlenbeck
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS)
+from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS
 
 BETA = 1e3  # 1/s, Rahaman 2019, section 4.1.2
 PARAMS = AccelerationFieldParams(
-    initial__mode="given", initial__angular_velocity=(5.0, 5.0, 5.0),
-    initial__angular_velocity_sd=1e-6, gravity=9.8)
+    initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=1e-6),
+    gravity=9.8)
 METHODS = {
     "AO (paper)": {"method": "ao"},
     "sqrt-AO": {"method": "sqrt_ao"},
@@ -46,12 +49,10 @@ def errors(rows, truth, gravity=9.8):
 def fitted_densities(params, sensors, stamp, readings):
     """``params`` with the motion densities of maximum likelihood from one recording."""
     estimator = AccelerationFieldEstimator(
-        params.replace(mode="smoothed", maximum_likelihood="motion", smoother__iterations=1),
-        sensors)
+        params.replace(**{"mode": "smoothed", "maximum_likelihood": "motion",
+                          "iteration.max": 1}), sensors)
     estimator.run(stamp, readings)
-    return params.replace(
-        motion__jerk_density=estimator.fitted.motion__jerk_density,
-        motion__acceleration_rate_density=estimator.fitted.motion__acceleration_rate_density)
+    return params.replace(motion=estimator.fitted.motion)
 
 
 def plus_minus(values):

@@ -16,11 +16,11 @@ import numpy as np
 import yaml
 
 from benchmarks.table import write_table
+from imu_fusion.messages.convert import imu_message
+from imu_fusion.messages.layouts import IMU
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.messages.convert import imu_message
-from imu_fusion.messages.layouts import IMU
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 NODE = "acceleration_field_estimator"

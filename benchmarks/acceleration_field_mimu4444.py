@@ -12,19 +12,26 @@ from scipy.interpolate import CubicSpline
 
 from benchmarks.data import data_path
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
-                                                      AccelerationFieldParams, GyroscopeParams)
 from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+    Iteration,
+    Motion,
+    Sensor,
+)
 
 RATE = 62.5
 LIMIT = np.radians(1000)
 # Where maximum likelihood begins: a hand's angular acceleration of about 500 rad/s^2 that
 # changes within 10 ms.
 BEGIN = AccelerationFieldParams(
-    sample_rate=RATE, mode="smoothed", initial__duration=5.0, smoother__iterations=10,
-    motion__rate=100.0, motion__jerk_density=1e6, motion__acceleration_rate_density=1e4,
-    noise_scale=10.0, maximum_likelihood="motion_and_noise")
+    sample_rate=RATE, mode="smoothed", initial=Initial(duration=5.0),
+    motion=Motion(rate=100.0, jerk_density=1e6, acceleration_rate_density=1e4),
+    noise_scale=10.0, maximum_likelihood="motion_and_noise", iteration=Iteration(max=1))
+ITERATIONS = 10
 FIT_SAMPLES = 2000  # of the recording, for maximum likelihood: 32 s, of which 20 s in motion
 
 
@@ -49,7 +56,7 @@ def load(run):
 def sensors(positions, noise):
     """The calibrated accelerometers, all in the axes of chip 0."""
     return [AccelerometerParams(position=tuple(p), noise_density=noise / np.sqrt(RATE),
-                                bias_sd=0.1, range=150.0) for p in positions]
+                                bias_sd=0.1, range=(150.0,)) for p in positions]
 
 
 def clipped_gyroscope(run):
@@ -61,10 +68,10 @@ def clipped_gyroscope(run):
     judged = clipped & ~at_range
     # The chips differ this much, by their scale factors; their mean is trusted no better.
     spread = np.sqrt(np.mean(np.var(gyr, axis=1)[~at_range.any(axis=1)]))
-    gyroscope = GyroscopeParams(noise_density=spread / np.sqrt(RATE) / BEGIN.noise_scale,
-                                range=LIMIT)
-    fit = AccelerationFieldEstimator(BEGIN.replace(smoother__iterations=1),
-                                     sensors(positions, noise), gyroscope)
+    gyroscope = Sensor(gyro_noise_density=spread / np.sqrt(RATE) / BEGIN.noise_scale,
+                       gyro_range=(LIMIT,))
+    fit = AccelerationFieldEstimator(BEGIN.replace(use_gyro=True, sensor=gyroscope),
+                                     sensors(positions, noise))
     fit.run(stamp[:FIT_SAMPLES], acc[:FIT_SAMPLES], given[:FIT_SAMPLES])
     results = {}
     seconds = stamp * 1e-9
@@ -72,11 +79,9 @@ def clipped_gyroscope(run):
                               for k, c in enumerate(clipped.T)])
     results["cubic spline through the rest"] = (spline - truth)[judged], np.nan
     for mode in ("causal", "smoothed"):
-        estimator = AccelerationFieldEstimator(
-            fit.fitted.replace(mode=mode, maximum_likelihood="off",
-                               smoother__iterations=BEGIN.smoother__iterations),
-            sensors(positions, noise), gyroscope)
-        rows = estimator.run(stamp, acc, given)
+        iteration = Iteration(max=ITERATIONS) if mode == "smoothed" else Iteration()
+        params = fit.fitted.replace(mode=mode, maximum_likelihood="off", iteration=iteration)
+        rows = AccelerationFieldEstimator(params, sensors(positions, noise)).run(stamp, acc, given)
         begin = len(stamp) - len(rows)
         use = judged[begin:]
         sd = np.sqrt(np.mean(np.einsum("nii->ni", rows["cov_omega"])[use]))
@@ -94,29 +99,29 @@ def accelerometers_only(run):
     windows = [slice(k, k + length) for k in range(700, len(stamp) - length, length)
                if np.sqrt(np.mean(np.sum(truth[k:k + length] ** 2, axis=1))) > 15
                and not unusable[k] and np.mean(unusable[k:k + length]) < 0.3]
-    begin = BEGIN.replace(initial__mode="given", initial__angular_velocity_sd=0.2)
+    begin = BEGIN.replace(initial=Initial(mode="given", angular_velocity_sd=0.2))
     # Five windows of maximum likelihood; the rest of the recording has no say.
     fits = []
     for window in windows[:5]:
         fit = AccelerationFieldEstimator(
-            begin.replace(initial__angular_velocity=tuple(truth[window.start]),
-                          smoother__iterations=1), sensors(positions, noise))
+            begin.replace(**{"initial.angular_velocity": tuple(truth[window.start])}),
+            sensors(positions, noise))
         fit.run(stamp[window], acc[window])
         fits.append(fit.fitted)
-    names = ("motion__rate", "motion__jerk_density", "motion__acceleration_rate_density",
+    names = ("motion.rate", "motion.jerk_density", "motion.acceleration_rate_density",
              "noise_scale")
-    fitted = begin.replace(maximum_likelihood="off", **{
-        name: float(np.exp(np.median([np.log(getattr(f, name)) for f in fits])))
-        for name in names})
-    cases = {"AO (paper)": {"method": "ao", "mode": "causal"},
-             "sqrt-AO": {"method": "sqrt_ao", "mode": "causal"},
-             "rigid_body, causal": {"mode": "causal"}, "rigid_body, smoothed": {}}
+    fitted = {name: float(np.exp(np.median([np.log(f.get(name)) for f in fits])))
+              for name in names}
+    given = AccelerationFieldParams(sample_rate=RATE, initial=begin.initial, max_condition=1e4)
+    cases = {"AO (paper)": {"method": "ao"}, "sqrt-AO": {"method": "sqrt_ao"},
+             "rigid_body, causal": fitted,
+             "rigid_body, smoothed": {**fitted, "mode": "smoothed", "iteration.max": ITERATIONS}}
     table = []
     for name, change in cases.items():
         found = []
         for window in windows:
-            params = fitted.replace(initial__angular_velocity=tuple(truth[window.start]),
-                                    max_condition=1e4, **change)
+            params = given.replace(**{
+                "initial.angular_velocity": tuple(truth[window.start]), **change})
             rows = AccelerationFieldEstimator(params, sensors(positions, noise)).run(
                 stamp[window], acc[window])
             error = np.sum((rows["omega"] - truth[window])[~unusable[window]] ** 2, axis=1)
@@ -125,7 +130,7 @@ def accelerometers_only(run):
         table.append([f"run {run}", name, f"{middle:.2f}", f"{low:.2f} - {high:.2f}",
                       len(windows)])
     speed = np.median([np.sqrt(np.mean(np.sum(truth[w] ** 2, axis=1))) for w in windows])
-    print(run, {name: getattr(fitted, name) for name in names}, f"speed {speed:.1f} rad/s")
+    print(run, fitted, f"speed {speed:.1f} rad/s")
     return table
 
 

@@ -10,9 +10,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
-                                                      AccelerationFieldParams)
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+    Motion,
+)
 from imu_fusion.estimation.acceleration_field.start import given_start
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS
 from imu_fusion.simulation.rigid_body_motion import draw_motion, ideal_readings
@@ -21,9 +25,9 @@ SAMPLES, RATE, NOISE = 300, 50.0, 1e-2
 STATES = ("attitude", "omega", "alpha", "specific_force", "acceleration_world")
 # Angular acceleration of sd 100 rad/s^2 that forgets itself within 1 / RATE s.
 PARAMS = AccelerationFieldParams(
-    initial__mode="given", initial__angular_velocity=(5.0, 5.0, 5.0),
-    initial__angular_velocity_sd=0.1, initial__orientation_sd=0.002, motion__rate=RATE,
-    motion__jerk_density=2 * 100 * RATE ** 1.5, motion__acceleration_rate_density=300.0)
+    initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=0.1,
+                    orientation_sd=0.002),
+    motion=Motion(rate=RATE, jerk_density=2 * 100 * RATE ** 1.5, acceleration_rate_density=300.0))
 
 
 def normalised(rows, states, quats, reference, gravity):
@@ -52,11 +56,11 @@ def main(realisations=200):
         found = []
         for _ in range(realisations):
             estimator = AccelerationFieldEstimator(params, sensors)
-            states, quats = draw_motion(params, given_start(params, estimator.layout), SAMPLES, rng)
-            readings = ideal_readings(estimator.layout, states)
+            states, quats = draw_motion(params, given_start(params, estimator.array), SAMPLES, rng)
+            readings = ideal_readings(estimator.array, states)
             readings += rng.normal(0, NOISE * params.sample_rate ** 0.5, readings.shape)
             rows = estimator.run(np.arange(SAMPLES) * 1_000_000, readings.reshape(-1, 4, 3))
-            found.append(normalised(rows, states, quats, estimator.layout.reference,
+            found.append(normalised(rows, states, quats, estimator.array.reference,
                                     params.gravity)[[SAMPLES // 2, SAMPLES - 1]])
         for k, when in enumerate(("middle", "end")):
             values = np.mean(found, axis=0)[k]

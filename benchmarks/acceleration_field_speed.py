@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.acceleration_field_cases import METHODS, PARAMS, noisy, paper_sensors
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.params import AccelerometerParams
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 SAMPLES = 5001
@@ -79,11 +79,15 @@ def main():
                                      np.full(3, 5.0)))
     table = [["paper, plain numpy", f"{1e6 * peer / SAMPLES:.1f}", "1", "", ""]]
     for name, change in METHODS.items():
-        make = lambda: AccelerationFieldEstimator(PARAMS.replace(**change), paper_sensors(10))
-        make().run(motion.stamp, readings)
-        warm = _time(lambda: make().run(motion.stamp, readings))
+        params = PARAMS.replace(**change)
 
-        def live():
+        def make(params=params):
+            return AccelerationFieldEstimator(params, paper_sensors(10))
+
+        make().run(motion.stamp, readings)
+        warm = _time(lambda make=make: make().run(motion.stamp, readings))
+
+        def live(make=make):
             estimator = make()
             for stamp, sample in zip(motion.stamp, readings):
                 estimator.add(stamp, sample)
@@ -98,17 +102,18 @@ def main():
     samples = rng.normal(0, 0.05, (long, 8, 3)) + [0, 0, 9.80665]
     stamp = np.arange(long) * 16_000_000
     for name, change in METHODS.items():
-        params = PARAMS.replace(sample_rate=62.5, initial__angular_velocity=(0.0, 0.0, 0.0),
-                                gravity=9.80665, **change)
-        duration = _time(lambda: AccelerationFieldEstimator(params, sensors).run(stamp, samples),
-                         1)
+        params = PARAMS.replace(**{
+            "sample_rate": 62.5, "initial.angular_velocity": (0.0, 0.0, 0.0), "gravity": 9.80665,
+            **change})
+        duration = _time(lambda params=params: AccelerationFieldEstimator(params, sensors).run(
+            stamp, samples), 1)
         table.append([f"{name}, 8 accelerometers, 600 s at 62.5 Hz: {duration:.1f} s",
                       f"{1e6 * duration / long:.1f}", "", "", ""])
     write_table("acceleration_field_speed",
                 ["method", "us per sample, warm", "times the plain numpy speed",
                  "us per sample, live add()", "first run with compilation, s"], table,
-                f"Four accelerometers, {SAMPLES} samples, one core; CPU time, so that other work on the "
-                "machine does not count.")
+                f"Four accelerometers, {SAMPLES} samples, one core; CPU time, so that other work "
+                "on the machine does not count.")
 
 
 if __name__ == "__main__":

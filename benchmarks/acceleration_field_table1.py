@@ -7,12 +7,23 @@ import sys
 
 import numpy as np
 
-from benchmarks.acceleration_field_cases import (METHODS, PARAMS, errors, fitted_densities, noisy,
-                                                 paper_sensors, plus_minus)
+from benchmarks.acceleration_field_cases import (
+    METHODS,
+    PARAMS,
+    errors,
+    fitted_densities,
+    noisy,
+    paper_sensors,
+    plus_minus,
+)
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
-                                                     simulate)
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_PARTICLE,
+    PAPER_POSITIONS,
+    simulate,
+)
 
 SIGMAS = (0, 1, 10, 100)
 PRINTED = {0: (1.56, 2.20), 1: (1.80, 2.85), 10: (8.42, 12.88), 100: (82.31, 126.49)}

@@ -25,7 +25,7 @@ SWEEPS = 24
 def rooms():
     """dict of room (module or folder directly below imu_fusion/) to what its docstring calls it.
 
-    These are its first words, up to a full stop, colon or semicolon.
+    That is its first sentence.
     """
     found = {}
     for path in sorted(PACKAGE.iterdir()):
@@ -33,7 +33,7 @@ def rooms():
         if file.suffix != ".py" or not file.exists() or path.name == "__init__.py":
             continue
         text = ast.get_docstring(ast.parse(file.read_text())) or ""
-        found[path.stem] = re.split(r"[.:;](?:\s|$)", " ".join(text.split()))[0].replace("``", "`")
+        found[path.stem] = re.split(r"\.(?:\s|$)", " ".join(text.split()))[0].replace("``", "`")
     return found
 
 

@@ -95,9 +95,9 @@ def fusion(imu, mag):
     return quat[:, [1, 2, 3, 0]]
 
 
-def ours(imu, mag, **changes):
+def ours(imu, mag, changes):
     """Rows of the orientation estimator."""
-    return OrientationEstimator(OrientationParams(**changes)).run(imu, mag)
+    return OrientationEstimator(OrientationParams.from_mapping(changes)).run(imu, mag)
 
 
 def share_within(rows, reference, mask):
@@ -161,8 +161,8 @@ def main(only_ours=False):
 
     # Ours takes the gyroscope's delay as its parameter and finds the magnetometer's itself,
     # so it always gets the recordings as they are.
-    def mine(**changes):
-        results = [ours(imu, mag, **changes) for imu, mag in prepared[0]]
+    def mine(changes):
+        results = [ours(imu, mag, changes) for imu, mag in prepared[0]]
         errors = np.array([broad_errors(r["quat_world_imu"], ref, mask)
                            for r, (_, _, ref, mask) in zip(results, trials, strict=True)])
         share = np.mean([share_within(r, ref, mask)
@@ -171,23 +171,23 @@ def main(only_ours=False):
 
     for name, changes in [("gyro_mag", dict(method="gyro_mag")),
                           ("gyro_mag as printed (Winkler 2025)",
-                           dict(method="gyro_mag", estimate_bias=False)),
-                          ("fusion, causal, use_acc false", dict(use_acc=False)),
+                           {"method": "gyro_mag", "gyro_mag.as_printed": True}),
+                          ("fusion, causal, use_acc false", {"fusion.use_acc": False}),
                           ("fusion, smoothed, use_acc false",
-                           dict(use_acc=False, mode="smoothed")),
+                           {"fusion.use_acc": False, "mode": "smoothed"}),
                           ("fusion, causal", {}), ("fusion, smoothed", dict(mode="smoothed"))]:
-        delays = dict(gyro_delay=GYR_DELAY)
+        delays = {"sensor.gyro_delay": GYR_DELAY}
         if name.startswith("gyro_mag as printed"):
-            delays["mag_delay"] = MAG_DELAY
-        plain, _ = mine(**changes)
-        errors, share = mine(**changes, **delays)
+            delays["sensor.mag_delay"] = MAG_DELAY
+        plain, _ = mine(changes)
+        errors, share = mine(changes | delays)
         add(name, "defaults", plain, errors, f"{100 * share:.0f} %")
-        if "method" in changes or "use_acc" in changes:
+        if "method" in changes or "fusion.use_acc" in changes:
             continue
         default = OrientationParams()
-        sets = [{}, dict(mag_sd=0.5), dict(mag_sd=2.0)]
-        tuned = leave_one_out(np.array([mine(**changes, **delays, **{
-            k: getattr(default, k) * v for k, v in s.items()})[0] for s in sets]))
+        sets = [{}, {"fusion.mag_disturbance_sd": 0.5}, {"fusion.mag_disturbance_sd": 2.0}]
+        tuned = leave_one_out(np.array([mine(changes | delays | {
+            k: default.get(k) * v for k, v in s.items()})[0] for s in sets]))
         add(name, "leave one out", None, tuned)
 
     if only_ours:

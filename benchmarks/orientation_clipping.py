@@ -55,8 +55,10 @@ def cases():
 def estimate(mode, imu, mag, delay):
     """Rows of the default estimator."""
     if mode != "lag 0.5 s":
-        return OrientationEstimator(OrientationParams(mode=mode, gyro_delay=delay)).run(imu, mag)
-    estimator = OrientationEstimator(OrientationParams(lag=0.5, gyro_delay=delay))
+        return OrientationEstimator(OrientationParams.from_mapping(
+            {"mode": mode, "sensor.gyro_delay": delay})).run(imu, mag)
+    estimator = OrientationEstimator(OrientationParams.from_mapping(
+        {"lag": 0.5, "sensor.gyro_delay": delay}))
     estimator.run(imu, mag)
     estimator.finish()
     return estimator.take_corrected()

@@ -40,7 +40,8 @@ def recording(seed, inclination_deg, rate=100.0, duration=30.0):
 
 def as_stated(seed, rate=100.0, duration=30.0):
     """A recording whose every error is drawn from what OrientationParams' defaults state."""
-    p, norm, dt = OrientationParams(), 48e-6, 1.0 / rate
+    params, norm, dt = OrientationParams(), 48e-6, 1.0 / rate
+    p, f = params.sensor, params.fusion
     rng = np.random.default_rng(seed)
     declination = float(rng.uniform(-30, 30))
     sensors = Sensors(
@@ -48,19 +49,19 @@ def as_stated(seed, rate=100.0, duration=30.0):
         mag_sd=p.mag_noise_sd, gyr_bias=tuple(rng.normal(0, p.gyro_bias_sd, 3)),
         gyr_matrix=np.eye(3) + rng.normal(0, p.gyro_scale_sd, (3, 3)), gyr_walk=p.gyro_bias_walk,
         acc_bias=tuple(rng.normal(0, p.acc_bias_sd, 3)),
-        mag_offset=tuple(rng.normal(0, p.mag_offset_sd * norm, 3)),
-        mag_matrix=np.linalg.inv(np.eye(3) - rng.normal(0, p.mag_matrix_sd, (3, 3))),
+        mag_offset=tuple(rng.normal(0, f.mag_offset_sd * norm, 3)),
+        mag_matrix=np.linalg.inv(np.eye(3) - rng.normal(0, f.mag_matrix_sd, (3, 3))),
         mag_delay=float(rng.normal(0, p.mag_delay_sd)))
     motion = Tumbling(seed=seed)
     imu, mag, truth, _ = simulate(
         motion, duration, rate=rate, sensors=sensors, seed=seed,
         field_world=earth_field(norm, math.radians(65), math.radians(declination)))
-    # mag_sd is that of a mean over 20 ms.
-    disturbance = p.mag_sd * math.sqrt(0.02 / dt) * rng.normal(size=mag.mag.shape)
-    keep = math.exp(-dt / p.local_field_time)
-    local = p.local_field_sd * rng.normal(size=3)
+    # mag_disturbance_sd is that of a mean over 20 ms.
+    disturbance = f.mag_disturbance_sd * math.sqrt(0.02 / dt) * rng.normal(size=mag.mag.shape)
+    keep = math.exp(-dt / f.local_field_time)
+    local = f.local_field_sd * rng.normal(size=3)
     for row in disturbance:
-        local = keep * local + p.local_field_sd * math.sqrt(1 - keep ** 2) * rng.normal(size=3)
+        local = keep * local + f.local_field_sd * math.sqrt(1 - keep ** 2) * rng.normal(size=3)
         row += local
     turn = Rotation.from_quat(motion.truth(mag.stamp * 1e-9)[0])
     return imu, MagLog(mag.stamp, mag.mag + norm * turn.inv().apply(disturbance)), truth, declination
@@ -77,9 +78,10 @@ def main():
             distance, error = [], []
             for seed in range(RUNS):
                 imu, mag, truth, declination = draw(seed)
-                out = OrientationEstimator(OrientationParams(
-                    mode=mode, axes_sd=0.0, gyro_delay=0.0, heading_anchor=anchor,
-                    declination_deg=declination)).run(imu, mag)
+                out = OrientationEstimator(OrientationParams.from_mapping({
+                    "mode": mode, "sensor.axes_sd": 0.0, "sensor.gyro_delay": 0.0,
+                    "alignment.heading_anchor": anchor,
+                    "declination_deg": declination})).run(imu, mag)
                 e = (Rotation.from_quat(out["quat_world_imu"]).inv()
                      * Rotation.from_quat(truth.quat_world_imu)).as_rotvec()
                 distance.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(out["cov_attitude"]), e))

@@ -62,11 +62,11 @@ def main():
     mag_ut = mag.mag * 1e6
 
     def batch(**params):
-        return lambda: OrientationEstimator(OrientationParams(**params)).run(imu, mag)
+        return lambda: OrientationEstimator(OrientationParams.from_mapping(params)).run(imu, mag)
 
     def single(**params):
         def run():
-            estimator = OrientationEstimator(OrientationParams(**params))
+            estimator = OrientationEstimator(OrientationParams.from_mapping(params))
             add_mag, add_imu, gyr, acc, field = (
                 estimator.add_mag, estimator.add_imu, imu.gyr, imu.acc, mag.mag)
             for i in range(n):

@@ -44,7 +44,8 @@ def main():
         vehicle = load(_VEHICLE)["orientation_estimator"]
         for label, changes in (("fusion", {}), ("fusion, orientation_vehicle.yaml", vehicle)):
             for mode in ("causal", "smoothed"):
-                out = OrientationEstimator(OrientationParams(mode=mode, **changes)).run(imu, mag)
+                out = OrientationEstimator(OrientationParams.from_mapping(
+                    {"mode": mode, **changes})).run(imu, mag)
                 found[f"{label}, {mode}"] = (out["stamp"], out["quat_world_imu"],
                                              out["cov_attitude"])
         found["VQF"] = (imu.stamp, vqf(imu, mag), None)

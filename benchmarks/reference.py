@@ -12,18 +12,16 @@ from pathlib import Path
 import imu_fusion
 from benchmarks import architecture
 from benchmarks.readme import fill
-from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.params import AccelerometerParams
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.base import Node
-from imu_fusion.parameters.declare import markdown_table
+from imu_fusion.parameters.declare import fields_of, is_group, markdown_table
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 WRITTEN_BY = "<!-- written by python -m benchmarks.reference -->\n"
 # Parameters of single sensors, of which there may be any number: prefix to class.
-PER_SENSOR = {"acceleration_field_estimator": {"accelerometers.<name>.": AccelerometerParams,
-                                               "gyroscope.": GyroscopeParams}}
+PER_SENSOR = {"acceleration_field_estimator": {"accelerometers.<name>.": AccelerometerParams}}
 
 
 def node_class(name):
@@ -45,11 +43,41 @@ def parameters(name):
     parts = [WRITTEN_BY, f"# Parameters of {name}\n", f"{_first_paragraph(node.__doc__)}\n",
              "How they are set: [Parameters](../parameters.md).\n"]
     for cls in node.PARAMETERS:
-        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n",
-                  markdown_table(cls) + "\n"]
+        parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n", *_tables(cls)]
     for prefix, cls in PER_SENSOR.get(name, {}).items():
         parts += [f"## {_title(cls)}\n", f"{_first_paragraph(cls.__doc__)}\n",
                   markdown_table(cls).replace("| `", f"| `{prefix}") + "\n"]
+    return "\n".join(parts)
+
+
+def _tables(cls):
+    """The table of the parameters at the top level, and under a heading that of each group."""
+    first, second, *rows = markdown_table(cls).splitlines()
+    groups = {field.name: kind for field, kind in fields_of(cls) if is_group(kind)}
+    parts = []
+    for name in (None, *groups):
+        own = [row for row, info in zip(rows, cls.infos())
+               if (info.name.split(".")[0] if "." in info.name else None) == name]
+        if name and own:
+            parts += [f"### {name}\n", f"{_first_paragraph(groups[name].__doc__)}\n"]
+        if own:
+            parts.append("\n".join([first, second, *own]) + "\n")
+    return parts
+
+
+def renamed():
+    """The page of parameters that have been renamed."""
+    parts = [WRITTEN_BY, "# Renamed parameters\n",
+             "A parameter file with an old name is refused, with the new one.\n"]
+    for name in NODES:
+        names = {old: new for cls in node_class(name).PARAMETERS
+                 for old, new in cls.OLD_NAMES.items()}
+        if names:
+            # Where there are two new names, with words between them, the names are in quotes.
+            rows = [f"| `{old}` | `{new}` |".replace("' ", "` ").replace(" '", " `")
+                    for old, new in sorted(names.items())]
+            parts += [f"## {name}\n",
+                      "\n".join(["| until 0.1.0 | now |", "|---|---|", *rows]) + "\n"]
     return "\n".join(parts)
 
 
@@ -82,6 +110,7 @@ def rooms():
 def pages():
     """dict of path to the text that belongs there."""
     found = {DOCS / "parameters" / f"{name}.md": parameters(name) for name in NODES}
+    found[DOCS / "parameters" / "renamed.md"] = renamed()
     found[DOCS / "conventions.md"] = conventions()
     found[DOCS / "images" / "architecture.svg"] = architecture.svg()
     page = DOCS / "architecture.md"

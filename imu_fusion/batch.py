@@ -1,48 +1,92 @@
 """Offline: a recording in, estimates out, without DDS and as fast as the machine can.
 
-Runs the same guards, estimators and message encoders as the nodes. For the same
+Runs the same streams as the nodes, in blocks of thousands of messages. For the same
 recording and parameters the estimates are those of the nodes, bit for bit.
 """
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from imu_fusion.errors import TopicError
+from imu_fusion.errors import ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.messages.convert import SampleType
+from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.results import write_results
-from imu_fusion.samples.guard import Guard, guard_log
-from imu_fusion.samples.logs import Log
+from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.stage import Stage, StageReport
+from imu_fusion.streams.stream import Messages, one_by_one
+
+Chosen = tuple[Stage, StageReport, Mapping[str, str]]
+"""A stage that can run, its report, and its topics to those in the recording."""
+
+_BLOCK = 4000    # messages read before the estimators take them
+
+Block = Mapping[tuple[str, Layout], Decoded]
+"""Messages by the name of their topic in the recording and their layout."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Recorded:
-    """One topic: the log as recorded, the one fit for use with its epochs, and the guard."""
+class _Feed:
+    """One estimator, from a recording into another one.
 
-    log: Log
-    usable: Log
-    epochs: np.ndarray
-    guard: Guard
+    Args:
+        names: its topics to those in the recording.
+    """
 
+    def __init__(self, stage: Stage, report: StageReport, names: Mapping[str, str],
+                 writer: BagWriter) -> None:
+        self._stage, self._report, self._names, self._writer = stage, report, names, writer
+        self._recorded: dict[str, list] = {topic: [] for topic in names}
+        self._stream = stage.stream(*report.params, warn=report.warnings.append)
+        self._stream.concludes = True
+        self._stream.reset(list(names))
 
-@dataclass(frozen=True, eq=False)
-class _Chosen:
-    """A stage that can run; ``names`` maps its topics to those in the recording."""
+    def take(self, block: Block) -> None:
+        """Messages of the recording."""
+        found = {}
+        for topic, name in self._names.items():
+            kind = self._stage.inputs[topic]
+            decoded = block.get((name, kind.layout))
+            if decoded is not None:
+                found[topic] = decoded
+                self._recorded[topic].append((decoded.stamp, kind.values(decoded.values),
+                                              decoded.frame_ids[:1]))
+        self._write(self._stream.take_decoded(found))
 
-    stage: Stage
-    report: StageReport
-    names: Mapping[str, str]
+    def finish(self) -> None:
+        """The end of the recording: what is held back, and the report."""
+        report, stream = self._report, self._stream
+        logs = {topic: self._stage.inputs[topic].log(
+                    np.concatenate([s for s, _, _ in parts]),
+                    np.concatenate([v for _, v, _ in parts]),
+                    next((f[0] for _, _, f in parts if f), ""))
+                for topic, parts in self._recorded.items()}
+        report.findings = list(self._stage.findings(logs))
+        del self._recorded
+        try:
+            self._write(stream.finish())
+            conclusion = stream.conclude()
+            for made in conclusion.made:
+                self._write(made)
+            report.results, report.summary = dict(conclusion.results), conclusion.summary
+            report.remarks = list(conclusion.remarks)
+        except ImuFusionError as error:    # the others go on
+            report.skipped = str(error)
+        for topic in self._names:
+            report.used[topic] = stream.guards[topic].counts[Verdict.OK]
+            refused = stream.refused(topic)
+            if refused:
+                report.refused[topic] = refused
 
-
-_Logs = Mapping[tuple[str, SampleType], _Recorded]
+    def _write(self, made: list[Messages]) -> None:
+        for topic, stamp, cdr in one_by_one(made):
+            self._writer.write("/" + topic, self._stage.outputs[topic], cdr, stamp)
+            self._report.written[topic] += 1
 
 
 def process(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
@@ -74,23 +118,34 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
         if not chosen:
             raise TopicError("nothing to do: " + "; ".join(
                 f"{r.node}: {r.skipped}" for r in reports))
-        kinds = {(name, c.stage.inputs[topic]) for c in chosen for topic, name in c.names.items()}
-        wanted = sorted({name for name, _ in kinds})
-        progress(f"reading {', '.join(wanted)} from {Path(bag).name}")
-        logs = _read(reader, wanted, kinds)
-        warnings = list(reader.warnings)
-    with BagWriter(out, overwrite=overwrite) as writer, announced_compiling(progress):
-        for one in chosen:
-            warnings += _run(one, logs, writer, progress)
-        write_results(writer.directory, {report.node: report.results for report in reports
-                                         if report.results})
-    warnings += [f"{report.node}: {text}" for report in reports for text in report.remarks]
+        wanted = {(name, stage.inputs[topic].layout) for stage, _, names in chosen
+                  for topic, name in names.items()}
+        progress(f"reading {', '.join(sorted({name for name, _ in wanted}))} from "
+                 f"{Path(bag).name}")
+        with BagWriter(out, overwrite=overwrite) as writer, announced_compiling(progress):
+            feeds = [_Feed(*one, writer) for one in chosen]
+            for block in _blocks(reader, wanted):
+                for feed in feeds:
+                    feed.take(block)
+            warnings = list(reader.warnings)
+            for feed, (stage, report, names) in zip(feeds, chosen):
+                feed.finish()
+                progress(f"{stage.node}: " + ", ".join(
+                    f"{report.used[topic]} {name}" for topic, name in names.items()))
+                if report.summary:
+                    progress(f"{stage.node}: {report.summary}")
+            write_results(writer.directory, {report.node: report.results for report in reports
+                                             if report.results})
+    warnings += [text for report in reports for text in report.findings]
+    warnings += [f"{report.node}: {text}" for report in reports
+                 for text in (*report.warnings, *report.remarks)]
     return reports, list(dict.fromkeys(warnings))
 
 
-def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageReport], list[_Chosen]]:
+def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageReport], list[Chosen]]:
     """A report per stage, and the stages that can run."""
-    reports, chosen = [], []
+    reports: list[StageReport] = []
+    chosen: list[Chosen] = []
     for stage in STAGES.values():
         # Left out or not: its parameters are checked.
         stage, params = stage.prepare(params_file)
@@ -103,34 +158,19 @@ def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageRepo
         else:
             names, report.skipped = find_inputs(reader, *stage.input_types(), remap)
             if not report.skipped:
-                chosen.append(_Chosen(stage, report, names))
+                chosen.append((stage, report, names))
     return reports, chosen
 
 
-def _read(reader: Reader, names, kinds) -> _Logs:
-    """What is recorded, by the name of the topic and its SampleType."""
-    raw: dict[str, list] = {name: [] for name in names}
-    for topic, _, _, cdr in reader.messages(names):
-        raw[topic].append(cdr)
-    logs = {(name, kind): kind.read(raw[name]) for name, kind in kinds}
-    return {key: _Recorded(log, *guard_log(log)) for key, log in logs.items()}
-
-
-def _run(chosen: _Chosen, logs: _Logs, writer: BagWriter, progress) -> list[str]:
-    """Write what a stage says and complete its report; what looks wrong with its logs."""
-    stage, report, names = chosen.stage, chosen.report, chosen.names
-    recorded = {topic: logs[name, stage.inputs[topic]] for topic, name in names.items()}
-    for topic, one in recorded.items():
-        report.used[topic] = len(one.usable)
-        if one.guard.refused():
-            report.refused[topic] = one.guard.refused()
-    progress(f"{stage.node}: "
-             + ", ".join(f"{len(one.log)} {names[topic]}" for topic, one in recorded.items()))
-    found = list(stage.findings({topic: one.log for topic, one in recorded.items()}))
-    inputs = {topic: (one.usable, one.epochs) for topic, one in recorded.items()}
-    for topic, stamp, cdr in stage.process_logs(inputs, report, *report.params):
-        writer.write("/" + topic, stage.outputs[topic], cdr, stamp)
-        report.written[topic] += 1
-    if report.summary:
-        progress(f"{stage.node}: {report.summary}")
-    return found
+def _blocks(reader: Reader, wanted: Collection[tuple[str, Layout]]) -> Iterator[Block]:
+    """What is recorded on the topics wanted, some thousand messages at a time."""
+    names = sorted({name for name, _ in wanted})
+    messages = reader.messages(names)
+    while True:
+        raw: dict[str, list] = {}
+        for topic, _, _, cdr in itertools.islice(messages, _BLOCK):
+            raw.setdefault(topic, []).append(cdr)
+        if not raw:
+            return
+        yield {(name, layout): layout.decode_block(raw[name]) for name, layout in wanted
+               if name in raw}

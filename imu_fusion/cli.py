@@ -66,7 +66,7 @@ class _NodeCommand(_ListingCommand):
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(imu_fusion.__version__)
-def cli():
+def cli() -> None:
     """Orientation, acceleration fields and trajectories from inertial sensors."""
 
 
@@ -97,7 +97,7 @@ overwrite_option = click.option("--overwrite", is_flag=True,
              listing=("Nodes", {name: node.summary for name, node in NODES.items()}))
 @click.argument("node", type=click.Choice(list(NODES)), metavar="NODE")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
-def start_node(node, arguments):
+def start_node(node: str, arguments: tuple[str, ...]) -> None:
     """Start NODE as `ros2 run imu_fusion NODE` would; ARGUMENTS go to it.
 
     Such as --ros-args -p NAME:=VALUE -r FROM:=TO, or --help for its parameters.
@@ -113,7 +113,8 @@ def start_node(node, arguments):
 @without_option
 @remap_option
 @overwrite_option
-def process(bag, out, params_file, without, remap, overwrite):
+def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+            remap: tuple[str, ...], overwrite: bool) -> None:
     """Run the estimators on BAG without ROS and write the rosbag2 directory OUT.
 
     An estimator runs if its topics are in the recording. The estimates are those
@@ -146,7 +147,8 @@ def process(bag, out, params_file, without, remap, overwrite):
 @click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
 @remap_option
 @overwrite_option
-def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
+def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+             with_report: bool, remap: tuple[str, ...], overwrite: bool) -> None:
     """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
 
     Each node is a process of an own ROS domain. OUT holds what was played and the estimates,
@@ -167,7 +169,7 @@ def pipeline(bag, out, params_file, without, with_report, remap, overwrite):
 @click.argument("bag", type=click.Path())
 @click.option("--repair", "target", type=click.Path(), metavar="OUT",
               help="Copy all that can be read into a clean recording OUT.")
-def info(bag, target):
+def info(bag: str, target: str | None) -> None:
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
     from imu_fusion.recordings.bag_reader import open_bag
     from imu_fusion.recordings.inspect import inspect_topics
@@ -204,7 +206,8 @@ def _number(value, form):
                    "and axes.")
 @remap_option
 @overwrite_option
-def convert(source, out, topics, description, remap, overwrite):
+def convert(source: str, out: str, topics: tuple[str, ...], description: str | None,
+            remap: tuple[str, ...], overwrite: bool) -> None:
     """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
 
     SOURCE may also be the folder of a phyphox CSV export (Accelerometer.csv, Gyroscope.csv, ...)
@@ -256,7 +259,7 @@ def convert(source, out, topics, description, remap, overwrite):
 @click.option("--topic", "topics", multiple=True, help="Play only this topic. Repeatable.")
 @click.option("--wait-for", "wait_for_nodes", multiple=True, metavar="NODE",
               help="Wait for one of our nodes. Repeatable.")
-def play(bag, arguments, **options):
+def play(bag: str, arguments: tuple[str, ...], **options) -> None:
     """Play BAG through the replayer node; further ARGUMENTS go to the node."""
     from imu_fusion.nodes import replayer
     sys.exit(replayer.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments]))
@@ -268,7 +271,7 @@ def play(bag, arguments, **options):
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd",
               show_default=True)
 @overwrite_option
-def record(out, topics, **options):
+def record(out: str, topics: tuple[str, ...], **options) -> None:
     """Record TOPICS (all, if none are given) into the rosbag2 MCAP directory OUT."""
     from imu_fusion.nodes import recorder
     sys.exit(recorder.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options)))
@@ -296,7 +299,7 @@ def _ros_args(**values):
               help="Recording with imu/data or acceleration_field/*, if not in BAG.")
 @params_file_option
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
-def report(bag, estimates, params_file, out):
+def report(bag: str, estimates: str | None, params_file: str | None, out: str) -> None:
     """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
 
     The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
@@ -313,20 +316,20 @@ def report(bag, estimates, params_file, out):
 @click.argument("name", default="orientation")
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,
               help="Directory for recording and report.")
-def demo(name, out):
+def demo(name: str, out: str) -> None:
     """Play a recording through the nodes, record, compare with the truth, report."""
     from imu_fusion.demos import run_demo
     run_demo(name, out, console)
 
 
 @cli.command()
-def compile():
+def compile() -> None:
     """Compile the kernels for this machine now, so that no node does when it starts."""
     from imu_fusion.compile_ahead import compile_ahead
     compile_ahead(lambda text: click.echo(text, err=True))
 
 
-def main():
+def main() -> None:
     """Entry point of the console script."""
     cli(prog_name="imu_fusion")
 

@@ -46,6 +46,15 @@ def njit(function: Callable) -> Callable:
     return dispatcher
 
 
+def entry_point(kernel: Callable, *arguments: object) -> Callable:
+    """The compiled function itself, for arguments of the types of these.
+
+    A call of a kernel looks its arguments' types up, which costs 3 us where some are structured
+    arrays; a call of what this returns does not. It takes arguments of just these types.
+    """
+    return kernel.compile(tuple(numba.typeof(argument) for argument in arguments))
+
+
 @contextmanager
 def announced_compiling(say: Callable[[str], object]) -> Iterator[None]:
     """Within, the first kernel that has to be compiled calls ``say`` with one line of text; kernels

@@ -31,10 +31,10 @@ def show(out: Path, console: Console) -> None:
         nodes.wait("replayer", 300)
         nodes.finish("recorder", 30.0)
     values = load(preset)["acceleration_field_estimator"]
-    limit = values["gyroscope"]["range"]
+    (limit,) = values["sensor"]["gyro_range"]
     preset_smoothed = out / "smoothed.yaml"
     preset_smoothed.write_text(yaml.safe_dump({"acceleration_field_estimator": {
-        "ros__parameters": {**values, "mode": "smoothed"}}}))
+        "ros__parameters": {**values, "mode": "smoothed", "iteration": {"max": 10}}}}))
     process(bag, smoothed, preset_smoothed, without=("orientation_estimator", "smoother"),
             overwrite=True)
     with open_bag(bag) as played:

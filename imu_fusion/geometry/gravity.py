@@ -1,6 +1,7 @@
 """Normal gravity of WGS84, closed form; gravity and Earth rotation in a local frame."""
 
 import numpy as np
+
 from imu_fusion.kernels import njit
 
 # WGS84 (NIMA TR8350.2, 3rd edition, tables 3.1, 3.3 and 3.4).
@@ -17,7 +18,7 @@ _EARTH_RATE = 7.292115e-5  # rad/s, ibid. table 3.1
 MEAN_RADIUS = 6371008.8
 
 
-def normal_gravity(latitude_deg, height):
+def normal_gravity(latitude_deg: float, height: float) -> float:
     """Magnitude of normal gravity in m/s^2, positive.
 
     Somigliana's formula on the ellipsoid (TR8350.2, eq. 4-1), continued to the
@@ -34,14 +35,14 @@ def normal_gravity(latitude_deg, height):
     return surface * (1.0 - 2.0 * (1.0 + _F + _M - 2.0 * _F * s2) * h + 3.0 * h * h)
 
 
-def earth_rate_world(latitude_deg):
+def earth_rate_world(latitude_deg: float) -> np.ndarray:
     """Rotation of the Earth (3,) in rad/s, east-north-up."""
     latitude = np.radians(latitude_deg)
     return _EARTH_RATE * np.array([0.0, np.cos(latitude), np.sin(latitude)])
 
 
 @njit
-def gravity_world(position_world, gravity):
+def gravity_world(position_world: np.ndarray, gravity: float) -> np.ndarray:
     """Gravity vector (3,) m/s^2, east-north-up, at a position near the origin.
 
     The tangent frame is flat and the Earth is not: 1 km away the plumb line has turned by

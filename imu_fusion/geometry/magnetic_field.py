@@ -18,16 +18,17 @@ def _model(epoch):
     return GeoMag(coefficients_file=_MODELS[epoch])
 
 
-def decimal_year(stamp):
+def decimal_year(stamp: int) -> float:
     """Decimal year of a stamp in nanoseconds since 1970 (UTC)."""
     seconds = int(stamp) // 10**9
-    year = datetime.datetime.fromtimestamp(seconds, datetime.timezone.utc).year
-    start, stop = (datetime.datetime(y, 1, 1, tzinfo=datetime.timezone.utc).timestamp()
+    year = datetime.datetime.fromtimestamp(seconds, datetime.UTC).year
+    start, stop = (datetime.datetime(y, 1, 1, tzinfo=datetime.UTC).timestamp()
                    for y in (year, year + 1))
     return year + (seconds - start) / (stop - start)
 
 
-def magnetic_field_world(latitude_deg, longitude_deg, height, year):
+def magnetic_field_world(latitude_deg: float, longitude_deg: float, height: float,
+                         year: float) -> np.ndarray:
     """Field vector (3,) in tesla, east-north-up, of the World Magnetic Model.
 
     Args:
@@ -48,7 +49,7 @@ def magnetic_field_world(latitude_deg, longitude_deg, height, year):
     return np.array([r.y, r.x, -r.z]) * 1e-9
 
 
-def declination(latitude_deg, longitude_deg, height, year):
+def declination(latitude_deg: float, longitude_deg: float, height: float, year: float) -> float:
     """Declination in rad, positive when magnetic north is east of true north."""
     field = magnetic_field_world(latitude_deg, longitude_deg, height, year)
     return np.arctan2(field[0], field[1])

@@ -7,9 +7,15 @@ arrays (3, 3). Whole logs are better served by ``scipy.spatial.transform``.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+
 from imu_fusion.kernels import njit
+
+Vector = Sequence[float] | np.ndarray   # three or four numbers
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 
 # Below this angle the truncated series are exact to float64 rounding:
 # the first neglected term is of the order angle^6 / 5040 of the value.
@@ -17,7 +23,7 @@ _SMALL = 1e-3
 
 
 @njit
-def quat_multiply(p, q):
+def quat_multiply(p: Vector, q: Vector) -> Quaternion:
     """Hamilton product p * q."""
     return (p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1],
             p[3] * q[1] - p[0] * q[2] + p[1] * q[3] + p[2] * q[0],
@@ -26,20 +32,20 @@ def quat_multiply(p, q):
 
 
 @njit
-def quat_conjugate(q):
+def quat_conjugate(q: Vector) -> Quaternion:
     """Inverse of a unit quaternion."""
     return -q[0], -q[1], -q[2], q[3]
 
 
 @njit
-def quat_normalize(q):
+def quat_normalize(q: Vector) -> Quaternion:
     """q, not zero, scaled to unit length."""
     size = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return q[0] / size, q[1] / size, q[2] / size, q[3] / size
 
 
 @njit
-def quat_rotate(q, v):
+def quat_rotate(q: Vector, v: Vector) -> Vector3:
     """v turned by the unit quaternion q."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     tx = 2.0 * (y * v[2] - z * v[1])
@@ -51,13 +57,13 @@ def quat_rotate(q, v):
 
 
 @njit
-def quat_rotate_inverse(q, v):
+def quat_rotate_inverse(q: Vector, v: Vector) -> Vector3:
     """v turned by the inverse of the unit quaternion q."""
     return quat_rotate(quat_conjugate(q), v)
 
 
 @njit
-def quat_exp(phi, scale=1.0):
+def quat_exp(phi: Vector, scale: float = 1.0) -> Quaternion:
     """Unit quaternion of the rotation vector ``scale * phi``, rad."""
     a, b, c = scale * phi[0], scale * phi[1], scale * phi[2]
     angle2 = a * a + b * b + c * c
@@ -70,7 +76,7 @@ def quat_exp(phi, scale=1.0):
 
 
 @njit
-def quat_log(q):
+def quat_log(q: Vector) -> Vector3:
     """Rotation vector of a unit quaternion, of angle at most pi, rad."""
     n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
     n = math.sqrt(n2)
@@ -85,7 +91,7 @@ def quat_log(q):
 
 
 @njit
-def quat_to_matrix(q):
+def quat_to_matrix(q: Vector) -> np.ndarray:
     """Rotation matrix of a unit quaternion. q: (4,). Returns (3, 3)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     m = np.empty((3, 3))
@@ -102,7 +108,7 @@ def quat_to_matrix(q):
 
 
 @njit
-def quat_from_matrix(m):
+def quat_from_matrix(m: np.ndarray) -> Quaternion:
     """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978).
 
     m: (3, 3). The largest component of the result is not negative.
@@ -134,7 +140,7 @@ def quat_from_matrix(m):
 
 
 @njit
-def quat_to_rpy(q):
+def quat_to_rpy(q: Vector) -> Vector3:
     """Roll, pitch, yaw of a unit quaternion: R = Rz(yaw) Ry(pitch) Rx(roll) (REP 103).
 
     Rad, pitch within +-pi/2; at pitch = +-pi/2 only roll -+ yaw is defined.
@@ -146,7 +152,7 @@ def quat_to_rpy(q):
 
 
 @njit
-def skew(v):
+def skew(v: Vector) -> np.ndarray:
     """Matrix [v]x with ``skew(v) @ u == cross(v, u)``. v: (3,). Returns (3, 3)."""
     m = np.zeros((3, 3))
     m[0, 1] = -v[2]
@@ -159,7 +165,7 @@ def skew(v):
 
 
 @njit
-def right_jacobian(phi):
+def right_jacobian(phi: Vector) -> np.ndarray:
     """J with ``Exp(phi + d) = Exp(phi) Exp(J d)`` to first order. Returns (3, 3)."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     angle = math.sqrt(angle2)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
-from imu_fusion.geometry.rotation import quat_to_matrix, quat_to_rpy
+from imu_fusion.geometry.rotation_arrays import rotation_matrices, rpy_angles
 from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
 from imu_fusion.samples import AttitudeLog, FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 from imu_fusion.samples.logs import Log
@@ -67,6 +67,15 @@ def fix_message(stamp: int, frame_id: str, latitude_deg: float, longitude_deg: f
                                         0 if cov_enu is None else _COVARIANCE_KNOWN])
 
 
+def fix_messages(stamp: np.ndarray, frame_id: str, values: np.ndarray) -> list[bytes]:
+    """CDR bytes of n sensor_msgs/NavSatFix: stamp (n,), values (n, 12): latitude, longitude
+    (degrees), height (m), covariance (m^2) row by row."""
+    full = np.empty((len(stamp), FIX.size))
+    full[:, 0], full[:, 1], full[:, -1] = 0, 1, _COVARIANCE_KNOWN
+    full[:, 2:-1] = values
+    return FIX.encode_block(stamp, frame_id, full)
+
+
 def velocity_message(stamp: int, frame_id: str, vel_world: ArrayLike,
                      cov_world: ArrayLike | None = None) -> bytes:
     """CDR bytes of a geometry_msgs/TwistWithCovarianceStamped. vel_world: (3,) m/s ENU."""
@@ -84,20 +93,42 @@ def pose_message(stamp: int, frame_id: str, quat_world_imu: Sequence[float] | np
     return POSE.encode(stamp, frame_id, [*position_world, *quat_world_imu])
 
 
-def orientation_message(row: np.void, frame_id: str, has_force: bool = True) -> bytes:
-    """CDR bytes of the sensor_msgs/Imu of one row of the orientation estimator.
+def imu_messages(stamp: np.ndarray, frame_id: str, gyr: np.ndarray, cov_gyr: np.ndarray,
+                 acc: np.ndarray, cov_acc: np.ndarray, quat: np.ndarray,
+                 cov_orientation: np.ndarray, has_force: np.ndarray) -> list[bytes]:
+    """CDR bytes of n sensor_msgs/Imu, as :func:`imu_message` makes them one by one.
 
-    ``has_force``: whether the sensor measures specific force; if not it is absent.
+    Args:
+        stamp: (n,) int64 ns. frame_id: of all of them.
+        gyr, acc: (n, 3); quat: (n, 4); the covariances: (n, 3, 3).
+        has_force: (n,) bool, whether acc is there; where not it is marked as absent.
     """
-    rotation = quat_to_matrix(row["quat_world_imu"])
-    return imu_message(row["stamp"], frame_id, row["gyr"], row["acc"] if has_force else None,
-                       row["quat_world_imu"],
-                       rotation @ row["cov_attitude"] @ rotation.T, row["cov_gyr"], row["cov_acc"])
+    values = np.zeros((len(stamp), IMU.size))
+    for field, value, cov in (("orientation", quat, cov_orientation),
+                              ("angular_velocity", gyr, cov_gyr),
+                              ("linear_acceleration", acc, cov_acc)):
+        values[:, IMU[field]] = value
+        values[:, IMU[field + "_covariance"]] = np.reshape(cov, (-1, 9))
+    absent = ~has_force
+    values[absent, IMU["linear_acceleration"]] = 0.0
+    values[absent, IMU["linear_acceleration_covariance"]] = ABSENT.ravel()
+    return IMU.encode_block(stamp, frame_id, values)
 
 
-def rpy_message(row: np.void, frame_id: str) -> bytes:
-    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of one row."""
-    return VECTOR3.encode(row["stamp"], frame_id, quat_to_rpy(row["quat_world_imu"]))
+def orientation_messages(rows: np.ndarray, frame_id: str, has_force: np.ndarray) -> list[bytes]:
+    """CDR bytes of the sensor_msgs/Imu of rows (n,) of the orientation estimator.
+
+    has_force: (n,) bool, whether the sensor measures specific force; where not it is absent.
+    """
+    rotation = rotation_matrices(rows["quat_world_imu"])
+    cov = rotation @ rows["cov_attitude"] @ rotation.transpose(0, 2, 1)
+    return imu_messages(rows["stamp"], frame_id, rows["gyr"], rows["cov_gyr"], rows["acc"],
+                        rows["cov_acc"], rows["quat_world_imu"], cov, has_force)
+
+
+def rpy_messages(rows: np.ndarray, frame_id: str) -> list[bytes]:
+    """CDR bytes of the geometry_msgs/Vector3Stamped with roll, pitch, yaw (rad) of rows (n,)."""
+    return VECTOR3.encode_block(rows["stamp"], frame_id, rpy_angles(rows["quat_world_imu"]))
 
 
 def bool_message(value: bool) -> bytes:

@@ -10,6 +10,8 @@ the default middleware; anything else is refused.
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +19,24 @@ from imu_fusion.errors import MessageError
 
 NANOSECONDS = 1_000_000_000
 _LITTLE = b"\x00\x01\x00\x00"
+
+
+_FEW = 8              # messages that are decoded or encoded faster one by one
+_FRAMES_AT_ONCE = 8   # different frame ids of one length that are looked for
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Messages of one type, in the order given, without those that could not be decoded.
+
+    ``stamp`` (n,) int64 ns, ``frame_ids`` list of n, ``values`` (n, size) as Layout.decode has
+    them; ``refused`` maps the places of the others in the list given to the reason.
+    """
+
+    stamp: np.ndarray
+    frame_ids: list
+    values: np.ndarray
+    refused: dict
 
 
 class Layout:
@@ -45,6 +65,7 @@ class Layout:
             position += count
         self.size = position + len(after)
         self._prefixes: dict[tuple[str, str], bytes] = {}
+        self._records: dict[tuple[str, int, int], np.dtype] = {}
         self._rest = {order: struct.Struct(f"{order}{self._count}d{after}") for order in "<>"}
 
     def __getitem__(self, field: str) -> slice:
@@ -70,10 +91,7 @@ class Layout:
                 raise MessageError(f"{self.msgtype}: header with a frame id of {length} bytes and "
                                    f"{nanosec} ns in a message of {len(cdr)} bytes")
             frame_id = bytes(cdr[16:end - 1]).decode("utf-8", "replace")
-            if self.child:
-                start = 4 + _align(end - 4, 4)
-                (length,) = struct.unpack_from(order + "I", cdr, start)
-                end = start + 4 + length
+            end = self._end_of_strings(order, cdr)
             values: tuple = ()
             for code in self._before:
                 size = struct.calcsize(code)
@@ -91,15 +109,102 @@ class Layout:
 
         Returns:
             (stamps (n,) int64, frame ids list of str, values (n, size) float64)
+
+        Raises:
+            MessageError: one of them is not one message of this type.
+        """
+        block = self.decode_block(messages)
+        if block.refused:
+            raise MessageError(next(iter(block.refused.values())))
+        return block.stamp, block.frame_ids, block.values
+
+    def decode_block(self, messages: Sequence[bytes]) -> Decoded:
+        """Decode what can be decoded: messages alike in one operation of numpy.
+
+        Args:
+            messages: sequence of bytes-like objects.
+
+        Returns:
+            Decoded, each number equal to that of :meth:`decode`.
         """
         n = len(messages)
-        stamps = np.empty(n, dtype=np.int64)
-        values = np.empty((n, self.size))
-        frames = []
+        block = Decoded(np.zeros(n, np.int64), [""] * n, np.zeros((n, self.size)), {})
+        alike: dict[tuple[int, bytes, bytes], list[int]] = {}
         for i, cdr in enumerate(messages):
-            stamps[i], frame_id, values[i] = self.decode(cdr)
-            frames.append(frame_id)
-        return stamps, frames, values
+            alike.setdefault((len(cdr), bytes(cdr[:4]), bytes(cdr[12:16])), []).append(i)
+        for indices in alike.values():
+            rest = np.array(indices)
+            for _ in range(_FRAMES_AT_ONCE):
+                if len(rest) < _FEW:
+                    break
+                rest = self._decode_alike(messages, rest, block)
+            for i in rest.tolist():
+                try:
+                    block.stamp[i], block.frame_ids[i], block.values[i] = self.decode(messages[i])
+                except MessageError as error:
+                    block.refused[i] = str(error)
+        if block.refused:
+            keep = [i for i in range(n) if i not in block.refused]
+            block = Decoded(block.stamp[keep], [block.frame_ids[i] for i in keep],
+                            block.values[keep], dict(sorted(block.refused.items())))
+        return block
+
+    def _decode_alike(self, messages: Sequence[bytes], indices: np.ndarray,
+                      block: Decoded) -> np.ndarray:
+        """Decode the messages whose strings are those of the first; return the other indices."""
+        first = messages[indices[0]]
+        try:
+            _, frame_id, _ = self.decode(first)
+        except MessageError as error:
+            block.refused[int(indices[0])] = str(error)
+            return indices[1:]
+        size = len(first)
+        rows = np.frombuffer(b"".join([messages[i] for i in indices]), np.uint8).reshape(-1, size)
+        order = self._order(first)
+        end = self._end_of_strings(order, first)
+        same = (rows[:, 12:end] == rows[0, 12:end]).all(axis=1)
+        record = self._record(order, end, size)
+        chosen = rows[same].view(record)[:, 0]
+        here = indices[same]
+        wild = chosen["nanosec"] >= NANOSECONDS
+        for i in here[wild].tolist():
+            try:
+                self.decode(messages[i])
+            except MessageError as error:
+                block.refused[i] = str(error)
+        block.stamp[here] = chosen["sec"].astype(np.int64) * NANOSECONDS + chosen["nanosec"]
+        for i in here.tolist():
+            block.frame_ids[i] = frame_id
+        for k in range(len(self._before)):
+            block.values[here, k] = chosen[f"before{k}"]
+        last = len(self._before) + self._count
+        block.values[here, len(self._before):last] = chosen["doubles"]
+        for k in range(len(self._after)):
+            block.values[here, last + k] = chosen[f"after{k}"]
+        return indices[~same]
+
+    def encode_block(self, stamp: np.ndarray, frame_id: str, values: np.ndarray,
+                     child_frame_id: str = "") -> list[bytes]:
+        """:meth:`encode` of n messages: stamp (n,) int64, values (n, size). Returns a list of
+        bytes."""
+        n = len(stamp)
+        if n < _FEW:
+            return [self.encode(s, frame_id, v, child_frame_id)
+                    for s, v in zip(stamp.tolist(), values)]
+        template = self.encode(0, frame_id, np.zeros(self.size), child_frame_id)
+        size = len(template)
+        record = self._record("<", self._end_of_strings("<", template), size)
+        rows = np.tile(np.frombuffer(template, np.uint8), (n, 1))
+        out = rows.view(record)[:, 0]
+        out["sec"], out["nanosec"] = np.divmod(stamp, NANOSECONDS)
+        for k in range(len(self._before)):
+            out[f"before{k}"] = values[:, k]
+        last = len(self._before) + self._count
+        out["doubles"] = values[:, len(self._before):last]
+        for k in range(len(self._after)):
+            out[f"after{k}"] = values[:, last + k]
+        data = rows.tobytes()
+        return [data[i:i + size] for i in range(0, n * size, size)]
 
     def encode(self, stamp: int, frame_id: str, values: Sequence[float] | np.ndarray,
                child_frame_id: str = "") -> bytes:
@@ -128,6 +233,37 @@ class Layout:
         for code, value in zip(self._after, values[last:]):
             body = _pad(body, struct.calcsize(code)) + struct.pack("<" + code, int(value))
         return _LITTLE + body
+
+    def _end_of_strings(self, order: str, cdr: bytes) -> int:
+        """Where the numbers may begin."""
+        end = 16 + struct.unpack_from(order + "I", cdr, 12)[0]
+        if self.child:
+            start = 4 + _align(end - 4, 4)
+            end = start + 4 + struct.unpack_from(order + "I", cdr, start)[0]
+        return end
+
+    def _record(self, order: str, end: int, size: int) -> np.dtype:
+        """The structured dtype of a message of ``size`` bytes whose strings end at ``end``."""
+        record = self._records.get((order, end, size))
+        if record is not None:
+            return record
+        fields: dict[str, tuple[Any, int]] = {
+            "sec": (order + "i4", 4), "nanosec": (order + "u4", 8)}
+        for part, codes in (("before", self._before), ("doubles", ""), ("after", self._after)):
+            if part == "doubles":
+                end = 4 + _align(end - 4, 8)
+                fields[part] = ((order + "f8", (self._count,)), end)
+                end += 8 * self._count
+            for k, code in enumerate(codes):
+                width = struct.calcsize(code)
+                end = 4 + _align(end - 4, width)
+                fields[f"{part}{k}"] = (order + np.dtype(code).str[1:], end)
+                end += width
+        record = np.dtype({"names": list(fields), "formats": [f for f, _ in fields.values()],
+                           "offsets": [o for _, o in fields.values()], "itemsize": size})
+        if len(self._records) < 64:  # lengths come from outside
+            self._records[order, end, size] = record
+        return record
 
     def _order(self, cdr):
         if len(cdr) < 16 or cdr[0] != 0 or cdr[1] not in (0, 1):

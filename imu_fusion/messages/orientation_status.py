@@ -7,7 +7,7 @@ bias as a geometry_msgs/TwistWithCovarianceStamped.
 
 import numpy as np
 
-from imu_fusion.estimation.orientation import state as st
+from imu_fusion.estimation.orientation import rows as st
 from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import TWIST
 
@@ -27,11 +27,19 @@ _MAG_SEEN = _MAG_FLAGS | st.FLAG_MAG_USED
 
 
 def lasting_flags(flags, before):
-    """The flags of a row that are in ``WORDS``; what a magnetometer sample showed lasts until
-    the next one. before: the result for the row before."""
-    if not flags & _MAG_SEEN:
-        flags |= before & _MAG_FLAGS
-    return flags & _LASTING
+    """The flags of rows that are in ``WORDS``; what a magnetometer sample showed lasts until the
+    next one.
+
+    Args:
+        flags: (n,) of the rows. before: the result for the row before the first.
+
+    Returns:
+        (n,) int64
+    """
+    flags = np.asarray(flags, dtype=np.int64)
+    shown = np.maximum.accumulate(np.where(flags & _MAG_SEEN, np.arange(len(flags)), -1))
+    last = np.where(shown < 0, before, flags[np.maximum(shown, 0)])
+    return (flags | last & _MAG_FLAGS) & _LASTING
 
 
 def flags_message(stamp, frame_id, flags):

@@ -2,12 +2,10 @@
 
 from std_srvs.srv import Trigger
 
-from imu_fusion.streams.acceleration_field import (NODE, NODE_PARAMETERS, OUTPUTS,
-                                                           SENSOR_PREFIXES,
-                                                           AccelerationFieldStream,
-                                                           FieldConfiguration)
 from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
+from imu_fusion.streams.acceleration_field import (
+    NODE, NODE_PARAMETERS, OUTPUTS, SENSOR_PREFIXES, AccelerationFieldStream, FieldConfiguration)
 
 
 class AccelerationFieldEstimatorNode(EstimatorNode):
@@ -23,7 +21,7 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         for cls in NODE_PARAMETERS[1:]:
             values.update(self.params(cls).to_mapping())
         config = FieldConfiguration.from_mapping(values, f"node {self.get_name()}")
-        self.attach(AccelerationFieldStream(config, warn=self.get_logger().warning), OUTPUTS)
+        self.attach(AccelerationFieldStream(config, self.get_logger().warning), OUTPUTS)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/smooth", self._on_smooth)
 
@@ -40,7 +38,9 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         if self._stream.config.field.mode != "smoothed":
             response.message = "mode is causal: nothing is held back; start with mode:=smoothed"
             return response
-        count = self._stream.smooth()
+        made = self._stream.smooth()
+        self.publish(made)
+        count = len(made[0].stamp) if made else 0
         response.success = count > 0
         response.message = (f"{count} samples smoothed and published" if count
                             else "no samples since the last time")

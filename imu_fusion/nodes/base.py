@@ -30,13 +30,8 @@ from imu_fusion.parameters.declare import ParameterInfo, Parameters, unknown_par
 
 P = TypeVar("P", bound=Parameters)
 
+_WIDE = 2**31 - 1  # of a side without a bound: editors of parameters take no more
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
-
-_ROS_TYPES = {
-    (float, False): Parameter.Type.DOUBLE, (float, True): Parameter.Type.DOUBLE_ARRAY,
-    (int, False): Parameter.Type.INTEGER, (int, True): Parameter.Type.INTEGER_ARRAY,
-    (bool, False): Parameter.Type.BOOL, (bool, True): Parameter.Type.BOOL_ARRAY,
-    (str, False): Parameter.Type.STRING, (str, True): Parameter.Type.STRING_ARRAY}
 
 # Parameters that belong to rclpy, not to us.
 _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
@@ -61,15 +56,16 @@ def descriptor(info: ParameterInfo) -> ParameterDescriptor:
     text = f"{info.doc} [{info.unit}]" if info.unit else info.doc
     result = ParameterDescriptor(name=info.name, description=text, read_only=info.read_only,
                                  additional_constraints=info.describe_bounds())
-    bounded = info.low is not None or info.high is not None
+    # No range where a value outside of it says "unset".
+    bounded = (info.low is not None or info.high is not None) and info.unset is None
     if bounded and not info.is_tuple and info.element is float:
         result.floating_point_range = [FloatingPointRange(
             from_value=float("-inf") if info.low is None else float(info.low),
             to_value=float("inf") if info.high is None else float(info.high))]
     elif bounded and not info.is_tuple and info.element is int:
         result.integer_range = [IntegerRange(
-            from_value=-2**63 if info.low is None else int(info.low),
-            to_value=2**63 - 1 if info.high is None else int(info.high), step=1)]
+            from_value=-_WIDE if info.low is None else int(info.low),
+            to_value=_WIDE if info.high is None else int(info.high), step=1)]
     return result
 
 
@@ -112,16 +108,17 @@ class Node(rclpy.node.Node):
     def close(self) -> None:
         """Release files; called once, whatever happened."""
 
-    def start_diagnostics(self, status: Callable[[], tuple[bytes, str, Mapping[str, object]]]
-                          ) -> None:
-        """Publish ``status() -> (level, message, {key: value})`` on `diagnostics` at 1 Hz."""
-        publisher = self.create_publisher(DiagnosticArray, "diagnostics", 10)
+    def start_diagnostics(self, task: str, status: Callable[
+            [], tuple[bytes, str, Mapping[str, object]]]) -> None:
+        """Publish ``status() -> (level, message, {key: value})`` on `/diagnostics` at 1 Hz, as
+        diagnostic_updater would: named ``node: task``, for the hardware "imu_fusion"."""
+        publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
         def publish():
             level, message, values = status()
             array = DiagnosticArray(status=[DiagnosticStatus(
-                level=level, name=self.get_fully_qualified_name().lstrip("/"), message=message,
-                values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
+                level=level, name=f"{self.get_fully_qualified_name().lstrip('/')}: {task}",
+                message=message, hardware_id="imu_fusion", values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
             array.header.stamp = self.get_clock().now().to_msg()
             publisher.publish(array)
 
@@ -150,20 +147,15 @@ class Node(rclpy.node.Node):
         for cls in self.PARAMETERS:
             own: dict[str, object] = {}
             for info in cls.infos():
-                value = given.get(info.name)
-                if info.name in given and info.is_tuple and not isinstance(value, bool):
-                    own[info.name] = value or ()  # rclpy has no empty lists of a type
-                elif value is not None:
-                    own[info.name] = value
+                if given.get(info.name) is not None:
+                    own[info.name] = given[info.name]
             values[cls] = cls.from_mapping(own, source=f"node {self.get_name()}")
             for info in cls.infos():
                 value = values[cls].get(info.name)
-                # rclpy cannot tell the type of an empty list: declared as not set.
-                unset = value is None or value == ()
-                self.declare_parameter(
-                    info.name, _ROS_TYPES[info.element, info.is_tuple] if unset else
-                    list(value) if info.is_tuple else value,
-                    descriptor(info), ignore_override=True)
+                # A parameter without a value would make a request for all of them fail.
+                value = info.unset if value is None or value == () else value
+                self.declare_parameter(info.name, list(value) if info.is_tuple else value,
+                                       descriptor(info), ignore_override=True)
         return values
 
     def _on_set_parameters(self, parameters):

@@ -1,7 +1,6 @@
 """The orientation estimator as a node: decode, one call, encode."""
 
 import math
-from collections.abc import Iterable
 
 import yaml
 from builtin_interfaces.msg import Time
@@ -16,7 +15,7 @@ from imu_fusion.streams.orientation import (ORIENTATION_TOPIC, OUTPUTS,
                                                     warm_up)
 from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.nodes.base import run_node
-from imu_fusion.nodes.estimator import EstimatorNode, Messages
+from imu_fusion.nodes.estimator import EstimatorNode
 
 
 def transform_broadcast(node):
@@ -60,22 +59,21 @@ class OrientationEstimatorNode(EstimatorNode):
         output = self.params(OrientationOutputParams)
         self._broadcast = transform_broadcast(self) if output.publish_tf else None
         warm_up(self.params(OrientationParams))
-        self.attach(OrientationStream(
-            self.params(OrientationParams), output, None,
-            self.get_logger().warning), OUTPUTS)
+        self.attach(OrientationStream(self.params(OrientationParams), output,
+                                      self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
             self.create_service(Trigger, f"~/{name}",
                                 lambda _, response, action=action: self._answer(response, action))
 
-    def publish(self, made: Iterable[Messages]) -> None:
+    def publish(self, made):
         super().publish(made)
         if self._broadcast is not None:
-            fixed_frame = self.params(OrientationOutputParams).fixed_frame
-            for topic, _, cdrs in made:
-                if topic == ORIENTATION_TOPIC:
-                    for cdr in cdrs:
-                        self._broadcast(transform(cdr, fixed_frame))
+            frame = self.params(OrientationOutputParams).fixed_frame
+            for part in made:
+                if part.topic == ORIENTATION_TOPIC:
+                    for cdr in part.cdrs:
+                        self._broadcast(transform(cdr, frame))
 
     def summary(self):
         return self._stream.estimator.summary()

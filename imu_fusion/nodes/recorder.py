@@ -90,7 +90,7 @@ class Recorder(Node):
         self._msgtypes: dict[str, str] = {}
         self._has_ended = False  # a session of which something was recorded
         steady_timer(self, 0.2, self._discover)
-        self.start_diagnostics(lambda: (b"\0", "recording", dict(self._writer.counts)))
+        self.start_diagnostics("recording", lambda: (b"\0", "recording", dict(self._writer.counts)))
 
     def work(self) -> float:
         """One turn: take all that waits, write it. See :meth:`Node.work`."""

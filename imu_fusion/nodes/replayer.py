@@ -97,7 +97,7 @@ class Replayer(Node):
         self.create_service(Trigger, "~/resume", self._on_resume)
         self.create_service(Trigger, "~/step", self._on_step)
         steady_timer(self, 1.0, self._tell)
-        self.start_diagnostics(lambda: (b"\0", self._phase.__name__.strip("_"), {
+        self.start_diagnostics("replay", lambda: (b"\0", self._phase.__name__.strip("_"), {
             publisher.topic: publisher.sent for publisher in self._outputs.values()}))
 
     def work(self) -> float:

@@ -1,5 +1,6 @@
 """The smoother as a node: collects, smooths in a child process when asked, publishes."""
 
+import itertools
 import multiprocessing
 import sys
 import time
@@ -16,10 +17,11 @@ from imu_fusion.kernels import announced_compiling
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.streams import smoother as smoothing
-from imu_fusion.streams.smoother import (INPUTS, OUTPUTS, PER_SAMPLE, Collection,
+from imu_fusion.streams.smoother import (INPUTS, OUTPUTS, PER_SAMPLE, SmootherStream,
                                            SmootherNodeParams, SmoothingParams)
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
+from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
@@ -38,7 +40,7 @@ def _smooth_in_child(connection, params, logs):
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smoothing.smooth(params, logs)
         samples = result.samples
-        outcome = smoothing.Outcome.of(result, logs[smoothing.IMU_TOPIC][0].frame_id)
+        outcome = smoothing.Outcome.of(result, logs[smoothing.IMU_TOPIC].frame_id)
         connection.send((outcome, len(samples)))
         for i in range(0, len(samples), _PIECE):
             connection.send_bytes(samples[i:i + _PIECE].tobytes())
@@ -105,7 +107,8 @@ class SmootherNode(Node):
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         p = self.params(SmootherNodeParams)
-        self._collection = Collection(p.memory_limit * 1e6, self.get_logger().warning)
+        self._stream = SmootherStream(self.params(SmoothingParams), p.memory_limit * 1e6,
+                                      self.get_logger().warning)
         self._flow = Flow(self, on_begin=self._on_begin)
         self._source = self._flow.source
         self.problems = self._flow.problems
@@ -124,15 +127,15 @@ class SmootherNode(Node):
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
         self.create_service(Trigger, "~/clear", self._on_clear)
-        self.start_diagnostics(self._status)
+        self.start_diagnostics("collection", self._status)
 
     def work(self):
-        """See :meth:`Node.work`."""
+        """One turn: take all that waits, smooth, publish. See :meth:`Node.work`."""
         self._flow.send()
         turn = self._flow.take()
-        for topic, messages in turn.blocks.items():
-            for cdr, _ in messages:
-                self._collection.push(self._names[topic], cdr)
+        if turn.blocks:
+            self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
+                               for topic, messages in turn.blocks.items()})
         self._flow.finish(turn)
         if self._answer is not None:
             # The executor polls the coroutine of a waiting service without rest.
@@ -150,7 +153,7 @@ class SmootherNode(Node):
 
     def _on_begin(self, session):
         if session.said.topics.keys() & self._names.keys():
-            self._collection.clear()
+            self._stream.reset()
 
     async def _on_smooth(self, request, response):
         response.success = False
@@ -161,12 +164,11 @@ class SmootherNode(Node):
             response.message = "refused: the last result is still being published"
             return response
         try:
-            logs = self._collection.logs()
-            smoothing.newest_epoch(logs)
+            logs = self._stream.logs()
         except ImuFusionError as error:
             response.message = str(error)
             return response
-        counts = ", ".join(f"{len(log)} {topic}" for topic, (log, _) in logs.items())
+        counts = ", ".join(f"{len(log)} {topic}" for topic, log in logs.items())
         self.get_logger().info(f"smoothing {counts}")
         self._answer = Future()
         self._child = _Child(self.params(SmoothingParams), logs)
@@ -197,8 +199,8 @@ class SmootherNode(Node):
             for topic, output in self._outputs.items():
                 output.renew(_latched(len(samples) if topic in PER_SAMPLE else 1))
             self._source.begin()
-            self._messages = smoothing.messages(samples, outcome,
-                                                self.params(SmoothingParams).path_rate)
+            made = smoothing.messages(samples, outcome, self.params(SmoothingParams).path_rate)
+            self._messages = itertools.chain.from_iterable(map(one_by_one, made))
         if self._messages is None:
             return False
         for _ in range(_SLICE):
@@ -214,18 +216,17 @@ class SmootherNode(Node):
         return True
 
     def _on_clear(self, request, response):
-        self._collection.clear()
+        self._stream.reset()
         response.success, response.message = True, "the collection is empty"
         return response
 
     def _status(self):
-        collection = self._collection
-        values = {f"{topic} collected": n for topic, n in collection.counts().items()}
-        values |= {f"{topic} {why}": n for topic, guard in collection.guards.items()
-                   for why, n in guard.refused().items()}
-        values |= {"megabytes": round(collection.bytes / 1e6, 1), "dropped": collection.dropped,
-                   "bad_messages": collection.bad_messages}
-        if collection.dropped:
+        stream = self._stream
+        values = {f"{topic} collected": n for topic, n in stream.counts().items()}
+        values |= {f"{topic} {why}": n for topic in stream.inputs
+                   for why, n in stream.refused(topic).items()}
+        values |= {"megabytes": round(stream.bytes / 1e6, 1), "dropped": stream.dropped}
+        if stream.dropped:
             return DiagnosticStatus.ERROR, "memory_limit reached, samples are dropped", values
         if self._answer is not None:
             return DiagnosticStatus.OK, "smoothing", values

@@ -85,6 +85,28 @@ class ParameterInfo:
             parts.append(" or ".join(map(str, lengths)) + " elements")
         return ", ".join(parts)
 
+    @property
+    def unset(self) -> Any:
+        """What stands for "unset" (or for an empty list) in ROS, which has no such values: nan, -1,
+        an empty string, or a list of one of these. None where the parameter always has a value."""
+        if not (self.optional or (self.is_tuple and self.length is None)):
+            return None
+        stand_in = {float: math.nan, int: -1, str: "", bool: None}[self.element]
+        return (stand_in,) if self.is_tuple else stand_in
+
+    def _is_unset(self, value: Any) -> bool:
+        if self.optional and (value is None or value == "null"):    # rcl reads null as a string
+            return True
+        unset = self.unset
+        if unset is None or isinstance(value, (bool, bytes)):
+            return False
+        if self.is_tuple:
+            if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 1:
+                return False
+            (value,), (unset,) = value, unset
+        return value == unset or (self.element is float and isinstance(value, float)
+                                  and math.isnan(value))
+
     def check(self, value: Any, source: str = "") -> Any:
         """Return ``value`` in this parameter's type, or raise ParameterError."""
         where = f" (from {source})" if source else ""
@@ -96,12 +118,14 @@ class ParameterInfo:
             raise ParameterError(
                 f"parameter '{self.name}'{where}: {value!r} {why}{allowed}{unit}")
 
+        if self._is_unset(value):
+            return None if self.optional else ()
         if value is None:
-            if self.optional:
-                return None
             refuse("is not a value")
         if not self.is_tuple:
             return self._check_element(value, refuse)
+        if self._may_be_one() and isinstance(value, (int, float)) and not isinstance(value, bool):
+            value = (value,)
         if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
             refuse(f"is not a list of {self.element.__name__}")
         result = tuple(self._check_element(v, refuse) for v in value)
@@ -110,6 +134,10 @@ class ParameterInfo:
             if len(result) not in lengths:
                 refuse(f"has {len(result)} elements")
         return result
+
+    def _may_be_one(self) -> bool:
+        """Whether a tuple of one stands for all elements: then a plain number does too."""
+        return isinstance(self.length, tuple) and 1 in self.length
 
     def _check_element(self, value: Any, refuse: Callable[[str], NoReturn]) -> Any:
         if self.element is bool:
@@ -237,14 +265,12 @@ class Parameters:
                     own[field.name] = kind._made(inner)
                 elif inner:
                     own[field.name] = field.default.replace(**inner)
-            elif field.name.replace("__", ".") in flat:
-                own[field.name] = flat[field.name.replace("__", ".")]
+            elif field.name in flat:
+                own[field.name] = flat[field.name]
         return cls(**own)
 
     def get(self, name: str) -> Any:
         """The value of a dotted name."""
-        if hasattr(self, name.replace(".", "__")):
-            return getattr(self, name.replace(".", "__"))
         value = self
         for part in name.split("."):
             value = getattr(value, part)
@@ -261,8 +287,6 @@ class Parameters:
         own: dict[str, Any] = {}
         inner: dict[str, dict[str, Any]] = {}
         for name, value in changes.items():
-            if hasattr(self, name.replace(".", "__")):
-                name = name.replace(".", "__")
             first, dot, rest = name.partition(".")
             if dot:
                 inner.setdefault(first, {})[rest] = value
@@ -286,8 +310,8 @@ def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
 
 def _info(field: dataclasses.Field, kind: Any) -> ParameterInfo:
     element, is_tuple, optional = split_type(kind)
-    return ParameterInfo(name=field.name.replace("__", "."), kind=kind, element=element,
-                         is_tuple=is_tuple, optional=optional, default=field.default, **field.metadata)
+    return ParameterInfo(name=field.name, kind=kind, element=element, is_tuple=is_tuple,
+                         optional=optional, default=field.default, **field.metadata)
 
 
 def unknown_parameter(name: str, classes: Iterable[type[Parameters]]) -> str:

@@ -10,6 +10,13 @@ from imu_fusion.errors import ParameterError
 from imu_fusion.parameters.declare import Parameters, flatten, unknown_parameter
 
 
+class _Loader(yaml.SafeLoader):
+    """Also reads lists as launch_ros writes them into the files that it makes: as tuples."""
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", yaml.SafeLoader.construct_sequence)
+
+
 def load(path: str | Path) -> dict[str, dict[str, Any]]:
     """Read a parameter file.
 
@@ -25,7 +32,7 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
     """
     path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.load(path.read_text(), _Loader)
     except OSError as error:
         raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -10,7 +10,7 @@
         columns: [a1x, a1y, a1z]       # of the measured axes, in the order x, y, z
         unit: g
         position: [150, 0, 0]          # and all else that describes an accelerometer
-    gyroscope: {columns: [wx, wy, wz], unit: deg/s}      # if there is one
+    gyroscope: {columns: [wx, wy, wz], unit: deg/s}      # if there is one; also noise_density, ...
     parameters: {points: [0.0, 0.0, 0.05]}               # further ones of the estimator
 
 The result is a recording and a parameter file of the acceleration field estimator for it.
@@ -20,13 +20,13 @@ import csv
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from imu_fusion.errors import BagError, ParameterError, SampleError
-from imu_fusion.estimation.acceleration_field.estimator import GyroscopeParams
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
+from imu_fusion.estimation.acceleration_field.params import AccelerometerParams, Sensor
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
 from imu_fusion.parameters.declare import Parameters, flatten, param
@@ -47,17 +47,26 @@ _SENSOR_AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
+class TimeParams(Parameters):
+    """``time.*``: when the rows were measured."""
+
+    column: str | None = param(None, doc="Column of the times; without one, give the rate.")
+    unit: str = param("s", choices=tuple(TIME_UNITS), doc="Unit of the times.")
+    start: float = param(
+        0.0, unit="s", low=0.0, doc="Added to the times. Give the Unix time of their zero.")
+    rate: float | None = param(
+        None, unit="Hz", low=1e-3, doc="Rate of the rows, if the table has no times.")
+
+
+@dataclass(frozen=True)
 class TableParams(Parameters):
     """How the table is written."""
 
     delimiter: str = param(",", doc="Between two cells: one character, 'tab' or 'space'.")
     skip_lines: int = param(0, low=0, doc="Lines ahead of the column names.")
     header: bool = param(True, doc="Whether a line of column names leads the rows.")
-    time__column: str | None = param(None, doc="Column of the times.")
-    time__unit: str = param("s", choices=tuple(TIME_UNITS), doc="Unit of the times.")
-    time__start: float = param(0.0, unit="s", low=0, doc="Added to the times.")
-    time__rate: float | None = param(None, unit="Hz", low=1e-3, doc="If there are no times.")
     position_unit: str = param("m", choices=tuple(LENGTH_UNITS), doc="Unit of the positions.")
+    time: TimeParams = TimeParams()
 
 
 @dataclass(frozen=True)
@@ -77,16 +86,16 @@ class _Sensor:
     """What to read of one sensor: (column, axis) pairs, factor to SI, its parameters."""
 
     topic: str
-    pairs: tuple
+    pairs: tuple[tuple[str, int], ...]
     factor: float
-    params: Parameters
+    params: AccelerometerParams | Sensor
 
     def messages(self, stamps, table, frame_id):
         """Yield (stamp, cdr)."""
         values = np.zeros((len(stamps), 3))
         for column, axis in self.pairs:
             values[:, axis] = table[column] * self.factor
-        rates = isinstance(self.params, GyroscopeParams)
+        rates = isinstance(self.params, Sensor)
         for stamp, value in zip(stamps, values):
             gyr, acc = (value, None) if rates else (None, value)
             yield int(stamp), imu_message(stamp, frame_id, gyr, acc)
@@ -100,7 +109,8 @@ _Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar(
     "tag:yaml.org,2002:str", text, style='"'))
 
 
-def import_csv(source, description, out, overwrite=False):
+def import_csv(source: str | Path, description: str | Path, out: str | Path,
+               overwrite: bool = False) -> tuple[Path, int]:
     """Convert a table to a recording and, beside it, a parameter file.
 
     Args:
@@ -124,9 +134,9 @@ def import_csv(source, description, out, overwrite=False):
     stamps, table = _read_table(source, table_params, columns)
     values = _parameters(sensors, given, stamps)
     config = FieldConfiguration.from_mapping(values, str(description))
-    config.make_estimator()  # a layout that cannot work is refused before anything is written
+    config.make_estimator()  # an array that cannot work is refused before anything is written
     rows = [(stamp, topic_rank, sensor.topic, cdr) for topic_rank, sensor in enumerate(sensors)
-            for stamp, cdr in sensor.messages(stamps, table, config.matching.body_frame)]
+            for stamp, cdr in sensor.messages(stamps, table, config.stream.body_frame)]
     rows.sort(key=lambda row: row[:2])
     with BagWriter(out, overwrite=overwrite) as writer:
         for stamp, _, topic, cdr in rows:
@@ -154,7 +164,7 @@ def _read_description(path):
     if isinstance(content.get("time"), dict) and "column" in content["time"]:
         content["time"] = {**content["time"], "column": str(content["time"]["column"])}
     table = TableParams.from_mapping(content, str(path))
-    if (table.time__column is None) == (table.time__rate is None):
+    if (table.time.column is None) == (table.time.rate is None):
         raise ParameterError(f"{path}: give either time.column or time.rate")
     if len(table.delimiter) != 1 and table.delimiter not in _DELIMITERS:
         raise ParameterError(f"{path}: delimiter '{table.delimiter}' is not one character, "
@@ -164,8 +174,9 @@ def _read_description(path):
     if not sensors:
         raise ParameterError(f"{path}: names no accelerometers")
     if gyroscope:
-        read, params = _split(gyroscope, _GyroscopeColumns, GyroscopeParams,
-                              f"{path}: gyroscope")
+        read, own = _split(gyroscope, _GyroscopeColumns, f"{path}: gyroscope")
+        params = Sensor.from_mapping({f"gyro_{name}": value for name, value in own.items()},
+                                     f"{path}: gyroscope")
         sensors.append(_Sensor(GYROSCOPE_TOPIC, tuple(zip(read.columns, range(3))),
                                RATE_UNITS[read.unit], params))
     return table, sensors, given
@@ -182,8 +193,9 @@ def _accelerometer(name, values, scale, path):
     if not str(name).isidentifier() or not str(name).isascii():
         raise ParameterError(f"{path}: accelerometer '{name}' would be part of a topic: letters, "
                              "digits and underscores only, no digit first")
-    read, params = _split(values, _AccelerometerColumns, AccelerometerParams,
-                          f"{path}: accelerometers.{name}")
+    source = f"{path}: accelerometers.{name}"
+    read, own = _split(values, _AccelerometerColumns, source)
+    params = AccelerometerParams.from_mapping(own, source)
     params = params.replace(position=tuple(scale * v for v in params.position))
     axes = [k for k, axis in enumerate(_SENSOR_AXES) if axis in params.measured_axes]
     if len(read.columns) != len(axes):
@@ -193,8 +205,8 @@ def _accelerometer(name, values, scale, path):
                    ACCELERATION_UNITS[read.unit], params)
 
 
-def _split(values, columns_class, params_class, source):
-    """What the table says of a sensor and what the estimator must know of it."""
+def _split(values, columns_class, source):
+    """What the table says of a sensor, and the other values: what the estimator must know."""
     names = {info.name for info in columns_class.infos()}
     own = {key: value for key, value in values.items() if key in names}
     if isinstance(own.get("columns"), list):
@@ -202,7 +214,7 @@ def _split(values, columns_class, params_class, source):
     else:
         raise ParameterError(f"{source}: 'columns' must list the columns of the table")
     return (columns_class.from_mapping(own, source),
-            params_class.from_mapping({k: v for k, v in values.items() if k not in names}, source))
+            {name: value for name, value in values.items() if name not in names})
 
 
 def _read_table(source, params, columns):
@@ -225,7 +237,7 @@ def _read_table(source, params, columns):
         names = [cell.strip() for cell in rows.pop(0)[1]]
     if len(rows) < 2:
         raise SampleError(f"{source}: {len(rows)} rows of numbers; is skip_lines or header right?")
-    wanted = sorted(columns) + ([params.time__column] if params.time__column else [])
+    wanted = sorted(columns) + ([params.time.column] if params.time.column else [])
     for name in wanted:
         if names.count(name) != 1:
             raise ParameterError(
@@ -233,13 +245,13 @@ def _read_table(source, params, columns):
                 f"there are: {', '.join(names)}")
     table = {name: np.array([read_number(source, number, name, row, names.index(name))
                              for number, row in rows]) for name in columns}
-    if params.time__column is None:
-        since = np.round(np.arange(len(rows)) * (NANOSECONDS / params.time__rate))
-        return since.astype(np.int64) + round(params.time__start * NANOSECONDS), table
-    place = names.index(params.time__column)
+    if params.time.column is None:
+        since = np.round(np.arange(len(rows)) * (NANOSECONDS / params.time.rate))
+        return since.astype(np.int64) + round(params.time.start * NANOSECONDS), table
+    place = names.index(params.time.column)
     stamps = np.array([_stamp(source, number, row, place, params) for number, row in rows])
     if stamps.min() < 0:
-        raise SampleError(f"{source}: column '{params.time__column}' begins at "
+        raise SampleError(f"{source}: column '{params.time.column}' begins at "
                           f"{stamps.min() * 1e-9:g} s; stamps cannot be negative: give time.start")
     return stamps, table
 
@@ -250,7 +262,7 @@ def _cell(source, line, name, row, place):
     return row[place].strip()
 
 
-def read_number(source, line, name, row, place):
+def read_number(source: str | Path, line: int, name: str, row: list[str], place: int) -> float:
     """The number in cell ``place`` of a row, NaN if empty; SampleError names what it is not."""
     text = _cell(source, line, name, row, place)
     try:
@@ -261,13 +273,13 @@ def read_number(source, line, name, row, place):
 
 
 def _stamp(source, line, row, place, params):
-    text = _cell(source, line, params.time__column, row, place)
+    text = _cell(source, line, params.time.column, row, place)
     try:
         # Seconds since 1970 exceed what a float tells apart in nanoseconds.
-        since = Decimal(text).scaleb(TIME_UNITS[params.time__unit])
-        return int(since.to_integral_value()) + round(params.time__start * NANOSECONDS)
+        since = Decimal(text).scaleb(TIME_UNITS[params.time.unit])
+        return int(since.to_integral_value()) + round(params.time.start * NANOSECONDS)
     except (InvalidOperation, ValueError, OverflowError):
-        raise SampleError(f"{source}, line {line}, column '{params.time__column}': '{text}' is "
+        raise SampleError(f"{source}, line {line}, column '{params.time.column}': '{text}' is "
                           "not a time") from None
 
 
@@ -283,11 +295,12 @@ def _parameters(sensors, given, stamps):
     arrays = {s.topic.rpartition("/")[2]: {"position": list(s.params.position),
                                            **_changed(s.params)} for s in sensors
               if isinstance(s.params, AccelerometerParams)}
-    values = {"accelerometers": {"names": list(arrays), **arrays}}
-    # The noise is written in any case: a group without parameters would not exist.
-    values |= {"gyroscope": {"noise_density": s.params.noise_density, **_changed(s.params)}
-               for s in sensors if isinstance(s.params, GyroscopeParams)}
+    values: dict[str, Any] = {"accelerometers": {"names": list(arrays), **arrays}}
     flat = flatten(given)
+    for s in sensors:
+        if isinstance(s.params, Sensor):
+            values["use_gyro"] = True
+            flat = {f"sensor.{name}": value for name, value in _changed(s.params).items()} | flat
     if "sample_rate" not in flat:
         step = np.median(np.diff(stamps))
         if step <= 0:

@@ -65,24 +65,24 @@ def _field(data, time):
         Panel("σ at the origin in m/s²", tuple(Line(words, time, sd, color)
                                                for words, sd, color in stated), from_zero=True)]
     words = ("Magnitudes at the query points. The specific force is what accelerometers there "
-             "would feel and needs no orientation; the kinematic acceleration is without gravity. As "
-             "a vector in the world it shares the uncertainty of the orientation, which turns it "
-             "and hardly changes its magnitude.")
+             "would feel and needs no orientation; the kinematic acceleration is without gravity. "
+             "As a vector in the world it shares the uncertainty of the orientation, which turns "
+             "it and hardly changes its magnitude.")
+    rate, turning = (np.linalg.norm(data.rows[name], axis=1).max() for name in ("omega", "alpha"))
     return Section("Acceleration field", (
         Numbers((Number("Samples", str(len(time))),
-                 Number("Peak acceleration", f"{magnitude.max():.1f} m/s²", "kinematic, all points"),
-                 Number("Peak rate", f"{np.linalg.norm(data.rows['omega'], axis=1).max():.1f} "
-                        "rad/s"),
-                 Number("Peak angular acc.", f"{np.linalg.norm(data.rows['alpha'], axis=1).max():.0f}"
-                        " rad/s²"))),
+                 Number("Peak acceleration", f"{magnitude.max():.1f} m/s²",
+                        "kinematic, all points"),
+                 Number("Peak rate", f"{rate:.1f} rad/s"),
+                 Number("Peak angular acc.", f"{turning:.0f} rad/s²"))),
         Table(("point x, y, z in m", "peak m/s²", "at s", "RMS m/s²", "peak specific force m/s²"),
               tuple(rows)),
         Figure(time_figure(panels), words),
         Figure(field_picture(data, time, magnitude[:, 0]),
-               "The kinematic acceleration of points of the body, in body axes, around the greatest "
-               "magnitude at the first query point. The slider moves through time; all arrows have "
-               "one scale and a dot as their head. The line from the origin without a head is the "
-               "angular velocity.",
+               "The kinematic acceleration of points of the body, in body axes, around the "
+               "greatest magnitude at the first query point. The slider moves through time; all "
+               "arrows have one scale and a dot as their head. The line from the origin without a "
+               "head is the angular velocity.",
                linked=False)))
 
 
@@ -94,7 +94,7 @@ def field_picture(data, time, magnitude):
     """
     # Half an event's default length to both sides, but at least as many samples as instants.
     step = np.median(np.diff(time)) if len(time) > 1 else 1.0
-    stride = max(1, int(round(data.config.impact.impact__duration / step / _INSTANTS)))
+    stride = max(1, int(round(data.config.stream.impact.duration / step / _INSTANTS)))
     first = int(np.argmax(magnitude)) - stride * (_INSTANTS // 2)
     first = max(0, min(first, len(time) - 1 - stride * (_INSTANTS - 1)))
     shown = np.arange(first, len(time), stride)[:_INSTANTS]
@@ -179,7 +179,8 @@ def _comparison(data, clipped):
     sd = np.sqrt(np.einsum("nii->ni", data.rows["cov_omega"]))
     known = np.isfinite(difference)
     table = []
-    for name, mask in (("gyroscope below its limit", known & ~clipped), (_CLIPPED, known & clipped)):
+    for name, mask in (("gyroscope below its limit", known & ~clipped),
+                       (_CLIPPED, known & clipped)):
         if not mask.any():
             continue
         part = difference[mask]
@@ -201,7 +202,7 @@ def _residuals(data, time):
     table, panels = [], []
     for k, name in enumerate(data.readings):
         residual = data.residuals(name)
-        sensor = data.config.accelerometers[name]
+        sensor = data.accelerometer(name)
         noise = sensor.noise_density * np.sqrt(data.config.field.sample_rate)
         with np.errstate(invalid="ignore"):
             limit = np.inf if sensor.range is None else sensor.range

@@ -21,7 +21,6 @@ from imu_fusion.samples.logs import Log
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
 from imu_fusion.streams.registry import STAGES
-from imu_fusion.streams.stage import StageReport
 from imu_fusion.surfaces.file import load_surface
 
 RAW, MAGNETOMETER, ESTIMATES = "imu/data_raw", "imu/mag", "imu/data"
@@ -54,9 +53,9 @@ class Contents:
         """The log of a topic, or None."""
         return self.logs.get(topic) if topic else None
 
-    def samples(self, topics: Iterable[str]) -> dict[str, tuple[Log, np.ndarray]]:
-        """dict of topic to (log, epochs), as a Stage takes it."""
-        return {topic: (self.logs[topic], np.zeros(len(self.logs[topic]), np.int64))
+    def samples(self, topics: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """dict of topic to (stamps, values), as a Stream uses them."""
+        return {topic: (self.logs[topic].stamp, self.logs[topic].flat())
                 for topic in topics if topic in self.logs and len(self.logs[topic])}
 
 
@@ -104,12 +103,12 @@ def estimate_orientation(contents: Contents, params_file: str | Path | None = No
     if RAW not in contents.logs:
         return None, Status.from_messages((), ())
     stage, params = STAGES["orientation_estimator"].prepare(params_file)
-    messages = stage.process_logs(contents.samples(stage.inputs),
-                                  StageReport(stage.node, params), *params)
-    cdrs: dict[str, list[bytes]] = {topic: [] for topic in (ESTIMATES, FLAGS_TOPIC, BIAS_TOPIC)}
-    for topic, _, cdr in messages:
-        if topic in cdrs:
-            cdrs[topic].append(cdr)
+    stream = stage.stream(*params)
+    stream.frame_ids = {topic: contents.logs[topic].frame_id for topic in stage.inputs
+                        if topic in contents.logs}
+    made = stream.use(contents.samples(stage.inputs)) + stream.flush()
+    cdrs = {topic: [cdr for part in made if part.topic == topic for cdr in part.cdrs]
+            for topic in (ESTIMATES, FLAGS_TOPIC, BIAS_TOPIC)}
     return (attitude_log(cdrs[ESTIMATES]),
             Status.from_messages(cdrs[FLAGS_TOPIC], cdrs[BIAS_TOPIC]))
 
@@ -125,7 +124,8 @@ def smooth_recording(contents: Contents, params_file: str | Path | None = None
         return None, None
     _, (params,) = STAGES["smoother"].prepare(params_file)
     try:
-        result = smoothing.smooth(params, contents.samples(smoothing.INPUTS))
+        result = smoothing.smooth(params, {
+            topic: contents.logs[topic] for topic in smoothing.INPUTS if topic in contents.logs})
     except (EstimationError, SampleError) as error:
         return None, f"There is no smoothed trajectory: {error}"
     surface = load_surface(params.surface.file) if params.surface.file else None

@@ -47,13 +47,17 @@ class FieldData:
         """dict of accelerometer to its position (3,) m."""
         return {name: np.array(a.position) for name, a in self.config.accelerometers.items()}
 
+    def accelerometer(self, name):
+        """AccelerometerParams of one, completed by those of all."""
+        return self.config.accelerometers[name].completed(self.config.field.sensor)
+
     def field(self, points):
         """(specific force, kinematic acceleration), each (n, p, 3) m/s^2 in body axes."""
         return field_at(self.rows, points, self.config.field.gravity)[:2]
 
     def residuals(self, name):
         """Readings of an accelerometer minus the estimated field, (n, 3) in its own axes."""
-        sensor = self.config.accelerometers[name]
+        sensor = self.accelerometer(name)
         force, kinematic = self.field([sensor.position])
         felt = force if sensor.reports == "specific_force" else kinematic
         residual = self.readings[name] - felt[:, 0] @ np.reshape(sensor.axes, (3, 3)).T
@@ -63,10 +67,11 @@ class FieldData:
     @property
     def clipped(self):
         """(n, 3) whether an axis of the gyroscope was taken to be at its limit."""
-        limit = self.config.gyroscope.range if self.config.gyroscope else None
+        sensor = self.config.field.sensor
+        limit = sensor.gyro_range
         if self.gyr is None or limit is None:
             return np.zeros((len(self.rows), 3), dtype=bool)
-        axes = np.reshape(self.config.gyroscope.axes, (3, 3))
+        axes = np.reshape(sensor.gyro_axes, (3, 3))
         own = np.abs(np.nan_to_num(self.gyr) @ axes.T) >= limit
         return (own.astype(float) @ np.abs(axes)) > 0.5
 
@@ -93,7 +98,7 @@ def read_field(bag, estimates, params_file=None):
     config = read_configuration(params_file)
     readings, gyr = _measured(bag, config, rows["stamp"])
     for name, reading in readings.items():
-        limit = config.accelerometers[name].range
+        limit = config.accelerometers[name].completed(config.field.sensor).range
         if limit is not None:
             with np.errstate(invalid="ignore"):
                 rows["flags"][(np.abs(reading) >= limit).any(axis=1)] |= SATURATED
@@ -131,7 +136,7 @@ def _rows(stamps, imu, covs, accel):
 def _measured(bag, config, stamps):
     """Readings of the accelerometers and the gyroscope at the stamps of the estimates."""
     readings, gyr = {}, None
-    tolerance = int(round(config.matching.match__tolerance * 1e9))
+    tolerance = int(round(config.stream.match.tolerance * 1e9))
     with open_bag(bag) as reader:
         for name in config.accelerometers:
             topic = f"accelerometers/{name}"
@@ -141,8 +146,7 @@ def _measured(bag, config, stamps):
         if find_topic(reader.topics, GYROSCOPE_TOPIC) is not None:
             log = read_log(reader, GYROSCOPE_TOPIC)
             gyr = _at(stamps, log.stamp, log.gyr, tolerance)
-            if config.gyroscope is not None:
-                gyr = gyr @ np.reshape(config.gyroscope.axes, (3, 3))
+            gyr = gyr @ np.reshape(config.field.sensor.gyro_axes, (3, 3))
     return readings, gyr
 
 
@@ -164,4 +168,4 @@ def _impacts(estimates, params_file, config, rows):
         return found.get(NODE, {}).get("impacts", [])
     if params_file is None:
         return []
-    return measure_impacts(rows, config.field.points, config.field.gravity, config.impact)
+    return measure_impacts(rows, config.field.points, config.field.gravity, config.stream.impact)

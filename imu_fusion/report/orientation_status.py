@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.estimation.orientation import state as st
+from imu_fusion.estimation.orientation import rows as st
 from imu_fusion.messages.orientation_status import bias_values, flags_value
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure

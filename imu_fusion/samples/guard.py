@@ -68,6 +68,36 @@ class Guard:
         return {verdict.value: count for verdict, count in self.counts.items()
                 if verdict is not Verdict.OK and count}
 
+    def check_block(self, stamp: np.ndarray,
+                    values: np.ndarray) -> tuple[list[Verdict] | None, np.ndarray]:
+        """Judge the next n samples, as :meth:`check` would one by one.
+
+        Args:
+            stamp: (n,) int64 ns.
+            values: (n, k) float64.
+
+        Returns:
+            The verdicts, None if all are fit for use, and the epoch of each, (n,) int64.
+        """
+        n = len(stamp)
+        if n and (self.last is None or stamp[0] > self.last) and (
+                (np.diff(stamp) > 0).all() and np.isfinite(values).all()):
+            self.counts[Verdict.OK] += n
+            self.last = int(stamp[-1])
+            return None, np.full(n, self.epoch, dtype=np.int64)
+        verdicts, epochs = [], np.zeros(n, dtype=np.int64)
+        for i in range(n):
+            verdicts.append(self.check(int(stamp[i]), values[i]))
+            epochs[i] = self.epoch
+        return verdicts, epochs
+
+
+def fit_for_use(verdicts: list[Verdict] | None, count: int) -> np.ndarray:
+    """(count,) bool of the verdicts of :meth:`Guard.check_block`."""
+    if verdicts is None:
+        return np.ones(count, dtype=bool)
+    return np.array([verdict is Verdict.OK for verdict in verdicts], dtype=bool)
+
 
 def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
     """The usable samples of a whole log.
@@ -75,16 +105,7 @@ def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
     Returns:
         (log of what is fit for use, epochs (n,) int64 of its samples, Guard with the counts)
     """
-    values = log.flat()
     guard = Guard()
-    steps = np.diff(log.stamp)
-    if len(log) and np.isfinite(values).all() and (steps > 0).all():
-        guard.counts[Verdict.OK] = len(log)
-        guard.last = int(log.stamp[-1])
-        return log, np.zeros(len(log), dtype=np.int64), guard
-    keep = np.zeros(len(log), dtype=bool)
-    epochs = np.zeros(len(log), dtype=np.int64)
-    for i in range(len(log)):
-        keep[i] = guard.check(int(log.stamp[i]), values[i]) is Verdict.OK
-        epochs[i] = guard.epoch
-    return log[keep], epochs[keep], guard
+    verdicts, epochs = guard.check_block(log.stamp, log.flat())
+    keep = fit_for_use(verdicts, len(log))
+    return (log, epochs, guard) if keep.all() else (log[keep], epochs[keep], guard)

@@ -1,12 +1,16 @@
 """Samples of several sensors that belong together, found by their stamps."""
 
 from bisect import bisect_left
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 Row = tuple[int, np.ndarray]
 """Stamp and readings (sensors, width) that belong to it."""
+
+Matched = tuple[np.ndarray, np.ndarray]
+"""Stamps (n,) int64 and readings (n, sensors, width); NaN where a sensor is missing."""
 
 
 class SampleMatcher:
@@ -55,6 +59,41 @@ class SampleMatcher:
         present.add(sensor)
         self._newest = stamp if self._newest is None else max(self._newest, stamp)
         return self._leaving(self._newest - self._hold)
+
+    def add_block(self, samples: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> Matched:
+        """Take stamps (n,) and values (n, width) of sensors, by number; what leaves of it, as one
+        by one in order of stamps, sensors of one stamp in order of their numbers."""
+        together = self._together(samples)
+        if together is not None:
+            return together
+        number = np.concatenate([np.full(len(s), k) for k, (s, _) in samples.items()])
+        stamp = np.concatenate([s for s, _ in samples.values()])
+        values = np.concatenate([v for _, v in samples.values()])
+        leaving: list[Row] = []
+        for i in np.lexsort([number, stamp]).tolist():
+            leaving += self.add(int(number[i]), int(stamp[i]), values[i])
+        return self._as_arrays(leaving)
+
+    def flush_block(self) -> Matched:
+        """:meth:`flush` as arrays."""
+        return self._as_arrays(self.flush())
+
+    def _together(self, samples: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> Matched | None:
+        """The usual case, as arrays: every sensor at the same stamps, nothing waiting."""
+        first = next(iter(samples.values()))[0]
+        if (self._stamps or len(samples) < self._shape[0] or not len(first)
+                or not all(np.array_equal(first, s) for s, _ in samples.values())
+                or (np.diff(first) <= self._tolerance).any()
+                or (self._left is not None and first[0] <= self._left + self._tolerance)):
+            return None
+        self._left = self._newest = int(first[-1])
+        return first, np.stack([samples[k][1] for k in range(self._shape[0])], axis=1)
+
+    def _as_arrays(self, rows: list[Row]) -> Matched:
+        if not rows:
+            return np.empty(0, np.int64), np.empty((0, *self._shape))
+        stamps, readings = zip(*rows)
+        return np.array(stamps, dtype=np.int64), np.array(readings)
 
     def flush(self) -> list[Row]:
         """All rows that still wait, complete or not."""

@@ -49,16 +49,17 @@ class MagCalibration:
         """Calibrated field, (..., 3) tesla."""
         return (np.asarray(mag) - self.offset) @ self.matrix.T
 
-    def to_parameters(self):
-        """``mag_offset``, ``mag_matrix``, ``mag_offset_sd`` as OrientationParams and YAML take them.
+    def to_parameters(self) -> dict[str, float | list[float]]:
+        """``sensor.mag_offset``, ``sensor.mag_matrix`` and ``fusion.mag_offset_sd`` as
+        OrientationParams and YAML take them.
 
-        ``mag_matrix_sd`` is not among them: an ellipsoid does not show how the magnetometer's
+        ``fusion.mag_matrix_sd`` is not among them: an ellipsoid does not show how the magnetometer's
         axes are turned against those of the Imu.
         """
         offset_sd = math.sqrt(np.trace(self.cov[:3, :3]) / 3.0) / self.field_norm
-        return dict(mag_offset=[float(v) for v in self.offset],
-                    mag_matrix=[float(v) for v in self.matrix.ravel()],
-                    mag_offset_sd=min(float(offset_sd), 1.0))
+        return {"sensor.mag_offset": [float(v) for v in self.offset],
+                "sensor.mag_matrix": [float(v) for v in self.matrix.ravel()],
+                "fusion.mag_offset_sd": min(float(offset_sd), 1.0)}
 
 
 def coverage(directions):

@@ -21,6 +21,9 @@ SENSOR: dict[str, dict[str, Any]] = {
         doc="Standard deviation of the gyroscope's bias at the start."),
     "gyro_bias_walk": dict(
         unit="rad/s/sqrt(s)", low=0.0, high=1.0, doc="Random walk of the gyroscope's bias."),
+    "gyro_axes": dict(
+        length=9, low=-1.0, high=1.0,
+        doc="The gyroscope's axes in body coordinates, row by row; orthonormal."),
     "gyro_scale_sd": dict(
         low=0.0, high=0.5, doc="Standard deviation of the gyroscope's scale errors, as states; 0: "
         "calibrated, no states."),

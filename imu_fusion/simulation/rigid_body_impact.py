@@ -10,16 +10,22 @@ The paper does not print the mass, the step, or the height of the half-space. Th
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize,
-                                          quat_rotate, quat_rotate_inverse)
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_rotate_inverse,
+)
+from imu_fusion.kernels import njit
 
 # Ratio of curvatures below which an ellipsoid is a blade: outside the table of the contact law.
 _SMALLEST_RATIO = 1e-3
@@ -153,44 +159,60 @@ def _shape_table():
     return _TABLE["table"]
 
 
+class _Body(NamedTuple):
+    """What does not change during the motion, in SI units."""
+
+    inertia: np.ndarray        # (3,) per unit mass, about the centre
+    r_ref: np.ndarray          # (3,) the centre in body coordinates
+    axes2: np.ndarray          # (3,) semi axes squared
+    ground: float
+    gravity: float
+    stiffness: float           # of the contact, per unit mass, without its shape factor
+    knot0: float               # of the spline of the shape factor, see _shape_table
+    knot_step: float
+    coefficients: np.ndarray
+
+
 @njit
-def _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step, coefficients):
+def _specific_load(r, q, body):
     """Force (world) and torque about the centre (body) per unit mass, eq. (B.8)-(B.10)."""
+    axes2 = body.axes2
     up = np.array(quat_rotate_inverse(q, (0.0, 0.0, 1.0)))
     scaled = axes2 * up
     support = np.sqrt(np.sum(scaled * up))
-    force = np.array([0.0, 0.0, -gravity])
+    force = np.array([0.0, 0.0, -body.gravity])
     torque = np.zeros(3)
-    gap = r[2] - support - ground
+    gap = r[2] - support - body.ground
     if gap < 0.0:
         # Principal radii at the lowest point: eigenvalues of the Hessian of the support function.
         half_sum = 0.5 * (np.sum(axes2) - np.sum(scaled * scaled) / support ** 2) / support
         product = axes2[0] * axes2[1] * axes2[2] / support ** 4
         root = np.sqrt(max(half_sum ** 2 - product, 0.0))
         ratio = (half_sum - root) / (half_sum + root)
-        u = min(max((np.log(ratio) - knot0) / knot_step, 0.0), len(coefficients) - 1e-9)
+        u = min(max((np.log(ratio) - body.knot0) / body.knot_step, 0.0),
+                len(body.coefficients) - 1e-9)
         i = int(u)
-        s = (u - i) * knot_step
-        c = coefficients[i]
+        s = (u - i) * body.knot_step
+        c = body.coefficients[i]
         factor = ((c[0] * s + c[1]) * s + c[2]) * s + c[3]
-        load = stiffness * factor * np.sqrt(half_sum + root) * (-gap) ** 1.5
+        load = body.stiffness * factor * np.sqrt(half_sum + root) * (-gap) ** 1.5
         force[2] += load
         torque = np.cross(-scaled / support, load * up)
     return force, torque
 
 
 @njit
-def _integrate(n, every, h, r, v, q, w, inertia, r_ref, axes2, ground, gravity, stiffness,
-               knot0, knot_step, coefficients, out):
-    """Explicit Lie-Stoermer-Verlet, eq. (B.2)-(B.7); one row of ``out`` every ``every`` steps."""
-    force, torque = _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step,
-                                   coefficients)
+def _integrate(n, every, h, r, v, q, w, body, out):
+    """Explicit Lie-Stoermer-Verlet, eq. (B.2)-(B.7); one row of ``out`` every ``every`` of n
+    steps of h s. r, v: (3,) position and velocity, world; q: (4,) is changed; w: (3,) body."""
+    inertia = body.inertia
+    force, torque = _specific_load(r, q, body)
     for step in range(n):
         if step % every == 0:
             row = out[step // every]
             alpha = (torque - np.cross(w, inertia * w)) / inertia
-            origin = (np.array(quat_rotate_inverse(q, force)) - np.cross(alpha, r_ref)
-                      - np.cross(w, np.cross(w, r_ref)))
+            origin = (np.array(quat_rotate_inverse(q, force)) - np.cross(alpha, body.r_ref)
+                      - np.cross(w, np.cross(w, body.r_ref)))
             row[0:4] = q
             row[4:7] = w
             row[7:10] = alpha
@@ -203,8 +225,7 @@ def _integrate(n, every, h, r, v, q, w, inertia, r_ref, axes2, ground, gravity, 
         turn = h * w_half
         r = r + h * v_half
         q[:] = quat_normalize(quat_multiply(q, quat_exp(turn)))
-        force, torque = _specific_load(r, q, axes2, ground, gravity, stiffness, knot0, knot_step,
-                                       coefficients)
+        force, torque = _specific_load(r, q, body)
         v = v_half + 0.5 * h * force
         w = (np.array(quat_rotate(quat_exp(turn, -1.0), momentum)) + 0.5 * h * torque) / inertia
 
@@ -233,10 +254,10 @@ def simulate(scene=ImpactScene(), duration=1.0, step=1e-5, every=100):
     stiffness = (2 ** 1.5 * np.pi / (3 * scene.mass) * scene.modulus / (1 - scene.poisson ** 2))
     rows = int(round(duration / (step * every))) + 1
     out = np.empty((rows, 19))
+    body = _Body(inertia, np.array([0.0, 0.0, scene.height]), axes2, float(scene.ground),
+                 float(scene.gravity), float(stiffness), *_shape_table())
     _integrate((rows - 1) * every + 1, every, step, *(np.array(v, dtype=float) for v in (
-        scene.position, scene.velocity, scene.quat, scene.omega)), inertia,
-        np.array([0.0, 0.0, scene.height]), axes2, scene.ground, scene.gravity, stiffness,
-        *_shape_table(), out)
+        scene.position, scene.velocity, scene.quat, scene.omega)), body, out)
     return RigidMotion(t=np.arange(rows) * (step * every), quat=out[:, 0:4], omega=out[:, 4:7],
                        alpha=out[:, 7:10], acc_origin=out[:, 10:13], position=out[:, 13:16],
                        velocity=out[:, 16:19], gravity=scene.gravity)

@@ -5,15 +5,24 @@ estimator says, no more and no less.
 """
 
 import numpy as np
-from imu_fusion.kernels import njit
 from scipy.linalg import cholesky
 
-from imu_fusion.estimation.acceleration_field.kernel import mean_rotation, motion_step
+from imu_fusion.estimation.acceleration_field.motion_model import mean_rotation, motion_step, parts
+from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
+from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
+from imu_fusion.estimation.acceleration_field.start import Start
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
+from imu_fusion.kernels import njit
 
 
 @njit
 def _walk(x, quat, h, step, factor, acc_factor, every, white, xs, quats):
+    """Integrate the mean x (18 + m,) and quat (4,) by steps of h s and their noise.
+
+    step: (4, 4) of the chain; factor (4, 4), acc_factor (2, 2): roots of the noise; white:
+    (steps, 4, 6). Every ``every`` steps a row of xs and quats is written.
+    """
+    s = parts(x)
     for n in range(len(white) + 1):
         if n % every == 0:
             xs[n // every] = x
@@ -25,21 +34,21 @@ def _walk(x, quat, h, step, factor, acc_factor, every, white, xs, quats):
         phi = mean_rotation(h, step, x) + push[0]
         quat = quat_normalize(quat_multiply(quat, quat_exp(phi)))
         chain = np.zeros((4, 3))
-        for k in range(1, 4):
-            chain[k] = x[3 * k:3 * k + 3]
+        chain[1], chain[2], chain[3] = s.omega, s.alpha, s.jerk
         chain = step @ chain + push
-        for k in range(1, 4):
-            x[3 * k:3 * k + 3] = chain[k]
-        x[12:15] += h * x[15:18] + acc_factor[0, 0] * white[n, 0, 3:]
-        x[15:18] += acc_factor[1, 0] * white[n, 0, 3:] + acc_factor[1, 1] * white[n, 1, 3:]
+        s.omega[:], s.alpha[:], s.jerk[:] = chain[1], chain[2], chain[3]
+        s.acc[:] += h * s.acc_rate + acc_factor[0, 0] * white[n, 0, 3:]
+        s.acc_rate[:] += acc_factor[1, 0] * white[n, 0, 3:] + acc_factor[1, 1] * white[n, 1, 3:]
 
 
-def draw_motion(params, start, samples, rng, substeps=20):
-    """Draw a motion from the prior of :mod:`imu_fusion.estimation.acceleration_field.kernel`.
+def draw_motion(params: AccelerationFieldParams, start: Start, samples: int,
+                rng: np.random.Generator, substeps: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a motion from the prior of
+    :mod:`imu_fusion.estimation.acceleration_field.motion_model`.
 
     Args:
-        params: AccelerationFieldParams; the motion densities and the sample rate count.
-        start: (x, cov, quat) of the estimator: the first state is drawn from it.
+        params: the motion densities and the sample rate count.
+        start: of the estimator: the first state is drawn from it.
         samples: number of samples.
         rng: numpy Generator.
         substeps: steps of the integration within one sample interval.
@@ -50,29 +59,31 @@ def draw_motion(params, start, samples, rng, substeps=20):
     mean, cov, quat = start
     variance, vectors = np.linalg.eigh(cov)
     x = mean + vectors @ (np.sqrt(np.maximum(variance, 0.0)) * rng.standard_normal(len(mean)))
-    quat = quat_normalize(quat_multiply(quat, quat_exp(x[:3])))
-    x[:3] = 0.0
+    quat = quat_normalize(quat_multiply(quat, quat_exp(parts(x).theta)))
+    parts(x).theta[:] = 0.0
     h = 1.0 / params.sample_rate / substeps
-    step, noise = motion_step(h, params.motion__rate)
+    step, noise = motion_step(h, params.motion.rate)
     # Scaled to powers of h, the chain's covariance is well conditioned.
     scale = h ** np.array([3.5, 2.5, 1.5, 0.5])
     factor = scale[:, None] * cholesky(noise / np.outer(scale, scale), lower=True)
     acc_noise = np.array([[h ** 3 / 3, h ** 2 / 2], [h ** 2 / 2, h]])
     xs, quats = np.empty((samples, len(x))), np.empty((samples, 4))
     white = rng.standard_normal(((samples - 1) * substeps, 4, 6))
-    _walk(x, quat, h, step, params.motion__jerk_density * factor,
-          params.motion__acceleration_rate_density * cholesky(acc_noise, lower=True), substeps,
+    _walk(x, quat, h, step, params.motion.jerk_density * factor,
+          params.motion.acceleration_rate_density * cholesky(acc_noise, lower=True), substeps,
           white, xs, quats)
     return xs, quats
 
 
-def ideal_readings(layout, states):
+def ideal_readings(array: SensorArray, states: np.ndarray) -> np.ndarray:
     """Channel readings (n, m) of states (n, 18 + m), with biases and without noise."""
-    omega, alpha, acc = states[:, 3:6], states[:, 6:9], states[:, 12:15]
-    out = np.empty((len(states), len(layout.density)))
-    for c, (u, r) in enumerate(zip(layout.direction, layout.lever)):
-        if layout.is_gyro[c]:
-            out[:, c] = omega @ u
+    s = parts(states)
+    out = np.empty((len(states), len(array.channels)))
+    for c, channel in enumerate(array.channels):
+        u, r = channel["direction"], channel["lever"]
+        if channel["is_gyro"]:
+            out[:, c] = s.omega @ u
         else:
-            out[:, c] = (acc + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))) @ u
-    return out + states[:, 18:]
+            out[:, c] = (s.acc + np.cross(s.alpha, r)
+                         + np.cross(s.omega, np.cross(s.omega, r))) @ u
+    return out + s.bias

@@ -20,7 +20,6 @@ from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.surfaces.hill import Hill
 
-
 _FADE = 0.8     # s, over which the wobble begins and ends
 FASTEST_WOBBLE = 1.0  # Hz, of the sensor's random motion against the skis
 

@@ -1,26 +1,36 @@
 """The orientation estimator between its topics, live and in batch."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
-from imu_fusion.estimation.orientation.state import FLAG_STILL
+from imu_fusion.estimation.orientation.rows import FLAG_STILL, ORIENTATION_DTYPE
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_rotate,
-                                          quat_rotate_inverse)
-from imu_fusion.messages.convert import (GYROSCOPE_FIRST, SAMPLE_TYPES, bool_message,
-                                         orientation_message, rpy_message)
+from imu_fusion.geometry.rotation import quat_exp, quat_rotate
+from imu_fusion.geometry.rotation_arrays import in_sensor_axes, turned_by
+from imu_fusion.messages.convert import (
+    GYROSCOPE_FIRST,
+    SAMPLE_TYPES,
+    bool_message,
+    orientation_messages,
+    rpy_messages,
+)
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
-from imu_fusion.messages.orientation_status import (FLAGS_TYPE, bias_message, flags_message,
-                                                    lasting_flags)
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import EstimatorNodeParams, Stream
+from imu_fusion.messages.orientation_status import (
+    FLAGS_TYPE,
+    bias_message,
+    flags_message,
+    lasting_flags,
+)
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.samples import MagLog, checks
+from imu_fusion.samples import ImuLog, MagLog, checks
+from imu_fusion.samples.blocks import joined
 from imu_fusion.sensors.magnetometer_calibration import MagCalibrator
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 
 FIX_TOPIC = "fix"
 MAG_TOPIC = "imu/mag"
@@ -39,6 +49,10 @@ OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TO
            FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype, SMOOTHED_TOPIC: IMU.msgtype}
 
 _UP = {"enu": 1.0, "nwu": 1.0, "ned": -1.0}  # z of the world frame's up
+_NO_FIX = np.empty(0, np.int64), np.empty((0, 13))
+_NO_MAG = np.empty(0, np.int64), np.empty((0, 3))
+_NO_IMU = np.empty(0, np.int64), np.empty((0, 6))
+_FEW = 4    # samples that are handed over faster one by one
 _BIAS_INTERVAL = 100_000_000  # ns; a bias does not change faster
 _CALIBRATION_INTERVAL = 50_000_000  # ns; turning sensors show a new direction about as often
 
@@ -84,29 +98,22 @@ class _Writer:
         self.yaw = None
 
     def messages(self, rows, frame_id):
-        """Yield (topic, stamp, cdr)."""
-        for row in rows:
-            stamp = int(row["stamp"])
-            row, message = self._orientation(row, frame_id)
-            yield ORIENTATION_TOPIC, stamp, message
-            yield RPY_TOPIC, stamp, rpy_message(row, frame_id)
-            flags = lasting_flags(int(row["flags"]), self._flags or 0)
-            if self._flags is None or (flags ^ self._flags) & FLAG_STILL:
-                yield STEADY_TOPIC, stamp, bool_message(bool(flags & FLAG_STILL))
-            if flags != self._flags:
-                self._flags = flags
-                yield FLAGS_TOPIC, stamp, flags_message(stamp, frame_id, flags)
-            if self._next_bias is None or stamp >= self._next_bias:
-                self._next_bias = stamp + _BIAS_INTERVAL
-                yield BIAS_TOPIC, stamp, bias_message(row, frame_id)
-        if len(rows):
-            east = quat_rotate(row["quat_world_imu"], (1.0, 0.0, 0.0))
-            self.yaw = math.atan2(self._up * east[1], east[0])
+        """Messages of rows, in order."""
+        if not len(rows):
+            return []
+        stamp = rows["stamp"]
+        rows, cdrs = self._orientations(rows, frame_id)
+        east = quat_rotate(rows["quat_world_imu"][-1], (1.0, 0.0, 0.0))
+        self.yaw = math.atan2(self._up * east[1], east[0])
+        return [Messages(ORIENTATION_TOPIC, stamp, cdrs),
+                Messages(RPY_TOPIC, stamp, rpy_messages(rows, frame_id)),
+                *self._status(rows, frame_id), self._biases(rows, frame_id)]
 
     def corrected(self, rows, frame_id):
-        """Yield (topic, stamp, cdr) of rows that looking ahead has corrected."""
-        for row in rows:
-            yield SMOOTHED_TOPIC, int(row["stamp"]), self._orientation(row, frame_id)[1]
+        """Messages of rows that looking ahead has corrected."""
+        if not len(rows):
+            return []
+        return [Messages(SMOOTHED_TOPIC, rows["stamp"], self._orientations(rows, frame_id)[1])]
 
     def restart(self):
         """What comes next is another stretch, perhaps at earlier stamps."""
@@ -117,21 +124,51 @@ class _Writer:
         """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
         self.turn += yaw - self.yaw
 
-    def _orientation(self, row, frame_id):
-        """A row as it is published, and its message."""
-        has_force = bool(row["acc"].any())   # zero: a gyroscope without an accelerometer
-        if self.turn or self._output.remove_gravity_vector:
-            row = self._changed(row, has_force)
-        return row, orientation_message(row, frame_id, has_force)
+    def _status(self, rows, frame_id):
+        """Messages of flags where they change."""
+        flags = lasting_flags(rows["flags"], self._flags or 0)
+        before = np.concatenate([[flags[0] if self._flags is None else self._flags], flags[:-1]])
+        changed, turned = flags != before, (flags ^ before) & FLAG_STILL != 0
+        if self._flags is None:
+            changed[0] = turned[0] = True
+        self._flags = int(flags[-1])
+        stamp = rows["stamp"]
+        return [
+            Messages(STEADY_TOPIC, stamp[turned],
+                     [bool_message(bool(f & FLAG_STILL)) for f in flags[turned].tolist()]),
+            Messages(FLAGS_TOPIC, stamp[changed], [
+                flags_message(s, frame_id, f)
+                for s, f in zip(stamp[changed].tolist(), flags[changed].tolist())])]
 
-    def _changed(self, row, has_force):
-        row = row.copy()
+    def _biases(self, rows, frame_id):
+        """Messages of the bias, at most one per _BIAS_INTERVAL."""
+        stamp, chosen = rows["stamp"], []
+        k = 0
+        while k < len(stamp):
+            if self._next_bias is not None and stamp[k] < self._next_bias:
+                k += int(np.searchsorted(stamp[k:], self._next_bias))
+                continue
+            chosen.append(k)
+            self._next_bias = int(stamp[k]) + _BIAS_INTERVAL
+            k += 1
+        return Messages(BIAS_TOPIC, stamp[chosen],
+                        [bias_message(rows[k], frame_id) for k in chosen])
+
+    def _orientations(self, rows, frame_id):
+        """Rows as they are published, and their messages."""
+        has_force = rows["acc"].any(axis=1)   # zero: a gyroscope without an accelerometer
+        if self.turn or self._output.remove_gravity_vector:
+            rows = self._changed(rows, has_force)
+        return rows, orientation_messages(rows, frame_id, has_force)
+
+    def _changed(self, rows, has_force):
+        rows = rows.copy()
         turn = quat_exp((0.0, 0.0, self._up * self.turn))
-        row["quat_world_imu"] = quat_multiply(turn, row["quat_world_imu"])
-        if self._output.remove_gravity_vector and has_force:
+        rows["quat_world_imu"] = turned_by(turn, rows["quat_world_imu"])
+        if self._output.remove_gravity_vector:
             up = (0.0, 0.0, self._up * self._output.gravity)
-            row["acc"] -= quat_rotate_inverse(row["quat_world_imu"], up)
-        return row
+            rows["acc"][has_force] -= in_sensor_axes(rows["quat_world_imu"][has_force], up)
+        return rows
 
 
 def turn_to_true_north(params, stamp, sample):
@@ -154,7 +191,7 @@ def turn_to_true_north(params, stamp, sample):
 
 def warm_up(params):
     """Compile, or load from the cache, what the first samples would otherwise wait for."""
-    estimator = OrientationEstimator(params.replace(alignment_duration=0.05))
+    estimator = OrientationEstimator(params.replace(**{"alignment.duration": 0.05}))
     for i in range(20):
         stamp = i * 10_000_000
         estimator.add_mag(stamp, np.array([0.0, 2e-5, -4e-5]))
@@ -162,8 +199,25 @@ def warm_up(params):
     estimator.finish()    # with a lag: the smoother
 
 
+def _take(estimator, stamp, gyr, acc, mag_stamp, mag):
+    """Samples through the estimator; returns its rows."""
+    if len(stamp) + len(mag_stamp) > _FEW:
+        return estimator.run(ImuLog(stamp, gyr, acc), MagLog(mag_stamp, mag))
+    rows, j = [], 0
+    for i in range(len(stamp)):
+        while j < len(mag_stamp) and mag_stamp[j] <= stamp[i]:
+            rows.append(estimator.add_mag(int(mag_stamp[j]), mag[j]))
+            j += 1
+        rows.append(estimator.add_imu(int(stamp[i]), gyr[i], acc[i]))
+    rows += [estimator.add_mag(int(mag_stamp[k]), mag[k]) for k in range(j, len(mag_stamp))]
+    rows = [part for part in rows if len(part)]
+    return rows[0] if len(rows) == 1 else np.concatenate([np.empty(0, ORIENTATION_DTYPE), *rows])
+
+
 class OrientationStream(Stream):
     """See :class:`imu_fusion.streams.stream.Stream`.
+
+    In mode ``smoothed`` nothing comes before the end of a session: then all of it does.
 
     Args:
         params: OrientationParams.
@@ -172,13 +226,13 @@ class OrientationStream(Stream):
 
     same_frame = (IMU_TOPIC, MAG_TOPIC)
 
-    def __init__(self, params=OrientationParams(), output=OrientationOutputParams(), emit=None,
+    def __init__(self, params=OrientationParams(), output=OrientationOutputParams(),
                  warn=lambda text: None):
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator = MagCalibrator()
         self._next_calibration = None
-        super().__init__(INPUTS, emit, warn)
+        super().__init__(INPUTS, warn)
 
     def reset(self, session_topics=None):
         self._writer = _Writer(self.params, self.output)
@@ -189,24 +243,35 @@ class OrientationStream(Stream):
         self._writer.restart()
         self._knows_north = False
         self._has_force = False
+        self._kept = []
 
-    def take(self, topic, stamp, sample):
-        if topic == IMU_TOPIC:
-            force = _without_lost(sample[None, 3:], self._has_force)[0]
-            self._has_force |= bool(force.any())
-            self._write(self.estimator.add_imu(stamp, sample[:3], force))
-        elif topic == MAG_TOPIC:
-            saturated = self.estimator.mag_saturated
-            self._write(self.estimator.add_mag(stamp, sample))
-            if (self.estimator.mag_saturated == saturated
-                    and (self._next_calibration is None or stamp >= self._next_calibration)):
-                self._calibrator.add(sample)
-                self._next_calibration = stamp + _CALIBRATION_INTERVAL
-        elif not self._knows_north:
-            self._find_north(stamp, sample)
+    def use(self, samples):
+        imu = samples.get(IMU_TOPIC, _NO_IMU)
+        mag = samples.get(MAG_TOPIC, _NO_MAG)
+        if self.params.mode == "smoothed":
+            self._kept.append((imu, mag))
+            self._find_north(*samples.get(FIX_TOPIC, _NO_FIX))
+            return []
+        # What is published from the first fix on refers to true north.
+        stamp, turn = self._first_north(*samples.get(FIX_TOPIC, _NO_FIX))
+        made = []
+        if stamp is not None:
+            before = [np.searchsorted(stamps, stamp) for stamps, _ in (imu, mag)]
+            made = self._run(*((s[:k], v[:k]) for (s, v), k in zip((imu, mag), before)))
+            imu, mag = ((s[k:], v[k:]) for (s, v), k in zip((imu, mag), before))
+            self._writer.turn += turn
+        return made + self._run(imu, mag)
 
     def flush(self):
-        self._write(self.estimator.finish())
+        made = []
+        if self._kept:
+            imu, mag = (joined(parts) for parts in zip(*self._kept))
+            self._kept = []
+            made = self._run(imu, mag)
+        return made + self._write(self.estimator.finish())
+
+    def conclude(self):
+        return Conclusion(results=self.estimator.summary())
 
     def change(self, params):
         """Go on with other values of parameters that may change at run time."""
@@ -234,7 +299,10 @@ class OrientationStream(Stream):
             CalibrationError: the samples do not determine it.
         """
         calibration = self._calibrator.result()
-        self.params = self.params.replace(**calibration.to_parameters())
+        changes = calibration.to_parameters()
+        if self.params.is_as_printed:
+            del changes["fusion.mag_offset_sd"]    # the printed method knows no such thing
+        self.params = self.params.replace(**changes)
         self.estimator = OrientationEstimator(self.params)
         self.restart()
         return calibration
@@ -250,24 +318,51 @@ class OrientationStream(Stream):
             found += checks.check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
         return [finding.text for finding in found]
 
-    def _find_north(self, stamp, sample):
-        try:
-            turn = turn_to_true_north(self.params, stamp, sample)
-        except ParameterError as error:
-            self.warn(f"north stays magnetic north: {error}; or set declination_deg")
-            turn = 0.0
-        if turn is not None:
+    def _find_north(self, stamps, values):
+        """Turn to true north once a fix tells where it is: whatever is published."""
+        stamp, turn = self._first_north(stamps, values)
+        if stamp is not None:
             self._writer.turn += turn
-            self._knows_north = True
+
+    def _first_north(self, stamps, values):
+        """(stamp, turn) of the first fix that tells true north; (None, 0.0) if none does, or if it
+        is known."""
+        for stamp, sample in zip(stamps.tolist(), values):
+            if self._knows_north:
+                break
+            try:
+                turn = turn_to_true_north(self.params, stamp, sample)
+            except ParameterError as error:
+                self.warn(f"north stays magnetic north: {error}; or set declination_deg")
+                turn = 0.0
+            if turn is not None:
+                self._knows_north = True
+                return stamp, turn
+        return None, 0.0
+
+    def _run(self, imu, mag):
+        """Samples through the estimator: (stamps, values) of both."""
+        self._collect(*mag)
+        stamp, values = imu
+        force = _without_lost(values[:, 3:], self._has_force)
+        self._has_force |= bool(force.any())
+        return self._write(_take(self.estimator, stamp, values[:, :3], force, *mag))
+
+    def _collect(self, stamps, values):
+        """Samples for a calibration of the magnetometer, as often as they may be new."""
+        k = 0
+        while k < len(stamps):
+            if self._next_calibration is not None and stamps[k] < self._next_calibration:
+                k += int(np.searchsorted(stamps[k:], self._next_calibration))
+                continue
+            self._calibrator.add(values[k])
+            self._next_calibration = int(stamps[k]) + _CALIBRATION_INTERVAL
+            k += 1
 
     def _write(self, rows):
-        if len(rows):
-            for message in self._writer.messages(rows, self.frame_ids[IMU_TOPIC]):
-                self.emit(*message)
-        rows = self.estimator.take_corrected()
-        if len(rows):
-            for message in self._writer.corrected(rows, self.frame_ids[IMU_TOPIC]):
-                self.emit(*message)
+        frame_id = self.frame_ids.get(IMU_TOPIC, "")
+        return (self._writer.messages(rows, frame_id)
+                + self._writer.corrected(self.estimator.take_corrected(), frame_id))
 
 
 def findings(logs):
@@ -283,61 +378,5 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def process_logs(logs, report, params, output):
-    """The messages that :class:`OrientationStream` emits for a session, from whole logs.
-
-    Args:
-        logs: dict of input topic to (log, epochs) of guarded samples.
-        report: gets the estimator's ``results``.
-        params: OrientationParams.
-        output: OrientationOutputParams.
-
-    Yields:
-        (topic, stamp, cdr)
-    """
-    estimator = OrientationEstimator(params)
-    writer = _Writer(params, output)
-    imu, imu_epochs = logs[IMU_TOPIC]
-    nothing = np.empty(0, np.int64)
-    mag, mag_epochs = logs.get(MAG_TOPIC, (MagLog(nothing, np.empty((0, 3))), nothing))
-    fix, fix_epochs = logs.get(FIX_TOPIC, (None, nothing))
-    for epoch in np.union1d(imu_epochs, mag_epochs):
-        estimator.reset()
-        writer.restart()
-        imu_part, mag_part = imu[imu_epochs == epoch], mag[mag_epochs == epoch]
-        imu_part = replace(imu_part, acc=_without_lost(imu_part.acc, False))
-        stamp, turn = _first_north(params, fix, fix_epochs == epoch)
-        if turn and params.mode == "smoothed":
-            writer.turn = turn  # looking ahead, north is known from the start
-        elif turn:
-            # What is published from the first fix on refers to true north.
-            before = [part[part.stamp < stamp] for part in (imu_part, mag_part)]
-            yield from writer.messages(estimator.run(*before), imu.frame_id)
-            yield from writer.corrected(estimator.take_corrected(), imu.frame_id)
-            writer.turn = turn
-            imu_part, mag_part = (part[part.stamp >= stamp] for part in (imu_part, mag_part))
-        rows = [estimator.run(imu_part, mag_part), estimator.finish()]
-        yield from writer.messages(np.concatenate(rows), imu.frame_id)
-        yield from writer.corrected(estimator.take_corrected(), imu.frame_id)
-    report.results = estimator.summary()
-
-
-def _first_north(params, fix, mask):
-    """(stamp, turn) of the first fix that tells true north; (None, 0.0) if none does."""
-    if fix is None or not mask.any():
-        return None, 0.0
-    chosen = fix[mask]
-    for stamp, sample in zip(chosen.stamp.tolist(), np.column_stack(
-            [chosen.latitude_deg, chosen.longitude_deg, chosen.height,
-             chosen.cov_enu.reshape(-1, 9), chosen.status])):
-        try:
-            turn = turn_to_true_north(params, stamp, sample)
-        except ParameterError:
-            return None, 0.0
-        if turn is not None:
-            return stamp, turn
-    return None, 0.0
-
-
 STAGE = Stage("orientation_estimator", (OrientationParams, OrientationOutputParams),
-              (EstimatorNodeParams,), INPUTS, (IMU_TOPIC,), OUTPUTS, process_logs, findings)
+              (EstimatorNodeParams,), INPUTS, (IMU_TOPIC,), OUTPUTS, OrientationStream, findings)

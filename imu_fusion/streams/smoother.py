@@ -5,7 +5,7 @@ end in :func:`smooth`, and so in the same messages.
 """
 
 import json
-from array import array
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,19 +13,18 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import EstimationError, MessageError, SampleError
+from imu_fusion.errors import EstimationError, MessageError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
-from imu_fusion.messages.typestore import TYPES
-from imu_fusion.messages.convert import SAMPLE_TYPES, fix_message
-from imu_fusion.messages.diagnostics import (DIAGNOSTICS_TYPE, diagnostics_message,
-                                             diagnostics_value)
+from imu_fusion.messages.convert import SAMPLE_TYPES, fix_messages
+from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import EstimatorNodeParams
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.declare import param
 from imu_fusion.samples import checks
-from imu_fusion.samples.guard import Guard, Verdict
+from imu_fusion.samples.blocks import Samples, joined
+from imu_fusion.streams.stage import Stage
+from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 from imu_fusion.surfaces.file import load_surface
 
 IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
@@ -85,103 +84,81 @@ class SmootherNodeParams(EstimatorNodeParams):
                                     "takes more (docs/smoother.md).")
 
 
-class Collection:
-    """Samples of the smoother's topics, as they come; guarded, in compact arrays.
+class SmootherStream(Stream):
+    """Collects samples, in compact arrays, until somebody calls :func:`smooth` on ``logs()``.
 
     One Imu sample takes 56 bytes, one of the magnetometer 32, one fix 112, one velocity
-    104: 32 MB an hour for Imu and magnetometer at 100 Hz.
+    104: 32 MB an hour for Imu and magnetometer at 100 Hz. When the clock is set back, what was
+    collected before is dropped.
 
     Args:
+        params: SmoothingParams.
         limit: bytes; what comes beyond is counted and dropped.
         warn: called with a text when something is wrong.
     """
 
-    def __init__(self, limit, warn=lambda text: None):
+    def __init__(self, params=SmoothingParams(), limit=math.inf, warn=lambda text: None):
+        self.params = params
         self.limit = limit
-        self._warn = warn
-        self.clear()
+        super().__init__(INPUTS, warn)
 
-    def clear(self):
-        """Forget everything."""
+    def restart(self):
         self.dropped = 0
-        self.bad_messages = 0
         self.bytes = 0
-        self.guards = {topic: Guard() for topic in INPUTS}
-        self._stamps = {topic: array("q") for topic in INPUTS}
-        self._samples = {topic: array("d") for topic in INPUTS}
-        self.frame_ids = {}
+        self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
 
-    def push(self, topic, cdr):
-        """Take the bytes of one message."""
-        kind, guard = INPUTS[topic], self.guards[topic]
-        try:
-            stamp, frame_id, values = kind.layout.decode(cdr)
-        except MessageError as error:
-            self.bad_messages += 1
-            self._warn(f"{topic}: message left out: {error}")
-            return
-        sample = kind.values(values)
-        epoch = guard.epoch
-        if guard.check(stamp, sample) is not Verdict.OK:
-            return
-        self.frame_ids.setdefault(topic, frame_id)
-        if guard.epoch > epoch:
-            self._warn(f"{topic}: the clock was set back: what was collected before is dropped")
-            self.bytes -= 8 * (1 + kind.width) * len(self._stamps[topic])
-            del self._stamps[topic][:], self._samples[topic][:]
-        size = 8 * (1 + kind.width)
-        if self.bytes + size > self.limit:
-            if not self.dropped:
-                self._warn(f"the collection has reached its limit of {self.limit / 1e6:g} MB: "
-                           "further samples are dropped; see memory_limit and smoother/clear")
-            self.dropped += 1
-            return
-        self.bytes += size
-        self._stamps[topic].append(stamp)
-        self._samples[topic].extend(sample)
+    def use(self, samples):
+        for topic, (stamp, values) in samples.items():
+            size = 8 * (1 + INPUTS[topic].width)
+            room = len(stamp) if math.isinf(self.limit) else min(
+                len(stamp), int((self.limit - self.bytes) // size))
+            if room < len(stamp):
+                if not self.dropped:
+                    self.warn(f"the collection has reached its limit of {self.limit / 1e6:g} MB: "
+                              "further samples are dropped; see memory_limit and smoother/clear")
+                self.dropped += len(stamp) - room
+            self.bytes += size * room
+            if room:
+                self._collected[topic].append((stamp[:room].copy(), values[:room].copy()))
+        return []
+
+    def flush(self):
+        return []
 
     def counts(self):
         """dict of topic to number of samples held."""
-        return {topic: len(stamps) for topic, stamps in self._stamps.items()}
+        return {topic: sum(len(stamp) for stamp, _ in parts)
+                for topic, parts in self._collected.items()}
 
     def logs(self):
-        """A snapshot: dict of topic to (log, epochs), topics without samples left out.
+        """A snapshot: dict of topic to log, topics without samples left out.
 
         Raises:
-            EstimationError: the limit was reached, so that the data have a hole at the end.
+            EstimationError: the limit was reached, so that the data have a hole at the end, or a
+                topic that is needed has no samples.
         """
         if self.dropped:
             raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
                                   f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
                                   "raise memory_limit")
-        logs = {}
-        for topic, kind in INPUTS.items():
-            n = len(self._stamps[topic])
-            if n:
-                stamps = np.array(self._stamps[topic], dtype=np.int64)
-                samples = np.array(self._samples[topic]).reshape(n, kind.width)
-                log = kind.log(stamps, samples, self.frame_ids[topic])
-                logs[topic] = log, np.full(n, self.guards[topic].epoch)
-        return logs
+        for parts in self._collected.values():
+            if len(parts) > 1:    # not again at the next call
+                parts[:] = [joined(parts)]
+        missing = [topic for topic in REQUIRED if not self._collected[topic]]
+        if missing:
+            raise EstimationError(
+                f"nothing to smooth: no samples on {' and '.join(missing)}"
+                + (" since the clock was set back" if self.restarts else ""))
+        return {topic: INPUTS[topic].log(*parts[0], self.frame_ids[topic])
+                for topic, parts in self._collected.items() if parts}
 
-
-def newest_epoch(logs):
-    """The samples since the clock was last set back: dict of topic to log.
-
-    Args:
-        logs: dict of topic to (log, epochs).
-
-    Raises:
-        EstimationError: a topic that is needed has no samples in it.
-    """
-    newest = max((int(epochs[-1]) for _, epochs in logs.values() if len(epochs)), default=0)
-    chosen = {topic: log[epochs == newest] for topic, (log, epochs) in logs.items()}
-    chosen = {topic: log for topic, log in chosen.items() if len(log)}
-    missing = [topic for topic in REQUIRED if topic not in chosen]
-    if missing:
-        raise EstimationError(f"nothing to smooth: no samples on {' and '.join(missing)}"
-                              + (" since the clock was set back" if newest else ""))
-    return chosen
+    def conclude(self):
+        """What the samples of a whole recording make: the smoothed trajectory."""
+        logs = self.logs()
+        result = smooth(self.params, logs)
+        outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
+        return Conclusion(messages(result.samples, outcome, self.params.path_rate),
+                          outcome.numbers, outcome.summary, outcome.remarks)
 
 
 def smooth(params, logs):
@@ -189,7 +166,7 @@ def smooth(params, logs):
 
     Args:
         params: SmoothingParams.
-        logs: dict of topic to (log, epochs).
+        logs: dict of topic to log, as SmootherStream.logs gives it.
 
     Returns:
         SmootherResult
@@ -197,10 +174,9 @@ def smooth(params, logs):
     Raises:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
-    chosen = newest_epoch(logs)
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoother(params, surface).run(chosen[IMU_TOPIC], chosen.get(MAG_TOPIC),
-                                         chosen[FIX_TOPIC], chosen.get(VELOCITY_TOPIC))
+    return Smoother(params, surface).run(logs[IMU_TOPIC], logs.get(MAG_TOPIC), logs[FIX_TOPIC],
+                                         logs.get(VELOCITY_TOPIC))
 
 
 @dataclass(frozen=True)
@@ -251,7 +227,7 @@ def results_value(cdr):
 
 
 def messages(samples, outcome, path_rate):
-    """Yield (topic, stamp, cdr) of a SmootherResult, in order of stamps, the path and the results
+    """Yield lists of Messages of a SmootherResult, in order of stamps, the path and the results
     last.
 
     Odometry is in ``world`` (east-north-up at the result's frame) with the twist in the
@@ -263,15 +239,17 @@ def messages(samples, outcome, path_rate):
     frame_id = outcome.frame_id
     for first in range(0, len(samples), _SLICE):
         rows = samples[first:first + _SLICE]
-        for stamp, odometry, imu, fix in zip(rows["stamp"], *_values(rows, outcome.frame)):
-            stamp = int(stamp)
-            yield ODOMETRY_TOPIC, stamp, ODOMETRY.encode(stamp, "world", odometry, frame_id)
-            yield SMOOTHED_IMU_TOPIC, stamp, IMU.encode(stamp, frame_id, imu)
-            yield SMOOTHED_FIX_TOPIC, stamp, fix_message(stamp, frame_id, *fix[:3], fix[3:])
+        stamp = np.ascontiguousarray(rows["stamp"])
+        odometry, imu, fix = _values(rows, outcome.frame)
+        yield [Messages(ODOMETRY_TOPIC, stamp,
+                        ODOMETRY.encode_block(stamp, "world", odometry, frame_id)),
+               Messages(SMOOTHED_IMU_TOPIC, stamp, IMU.encode_block(stamp, frame_id, imu)),
+               Messages(SMOOTHED_FIX_TOPIC, stamp, fix_messages(stamp, frame_id, fix))]
     if len(samples):
         last = int(samples["stamp"][-1])
-        yield PATH_TOPIC, last, _path(samples, path_rate)
-        yield RESULTS_TOPIC, last, outcome.message(last)
+        at = np.array([last])
+        yield [Messages(PATH_TOPIC, at, [_path(samples, path_rate)]),
+               Messages(RESULTS_TOPIC, at, [outcome.message(last)])]
 
 
 def _values(rows, frame):
@@ -336,19 +314,6 @@ def findings(logs):
     return [finding.text for finding in found]
 
 
-def process_logs(logs, report, params):
-    """Batch: the messages that the node publishes after smoothing the same samples."""
-    try:
-        result = smooth(params, logs)
-    except (EstimationError, SampleError) as error:
-        report.skipped = str(error)
-        return
-    outcome = Outcome.of(result, logs[IMU_TOPIC][0].frame_id)
-    report.summary, report.results = outcome.summary, outcome.numbers
-    report.remarks = outcome.remarks
-    yield from messages(result.samples, outcome, params.path_rate)
-
-
 def _configure(stage, params_file):
     (params,) = stage.read_params(params_file)
     if params.surface.file:
@@ -357,4 +322,4 @@ def _configure(stage, params_file):
 
 
 STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, REQUIRED, OUTPUTS,
-              process_logs, findings, _configure)
+              SmootherStream, findings, _configure)

@@ -1,12 +1,14 @@
 """One estimator between topics, as ``process``, the pipeline and the report use it."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import parameters_for
+from imu_fusion.streams.stream import Stream
 
 
 def _no_findings(logs: Mapping) -> list[str]:
@@ -24,9 +26,7 @@ class Stage:
         inputs: topic to the SampleType that reads it; ``required`` are those without which it
             cannot run.
         outputs: topic to message type.
-        process_logs: ``(logs, report, *params)`` yields (topic, stamp, cdr) of the outputs and
-            fills in the StageReport; ``logs`` maps a topic to (log, epochs) of the samples fit for
-            use, without topics that the recording lacks.
+        stream: ``(*params, warn=...)`` makes the Stream.
         findings: ``(logs)`` lists in words what looks wrong with whole logs as recorded.
         configure: ``(stage, params_file)`` is (Stage, parameters), where reading the parameters is
             not all: topics may depend on them.
@@ -39,12 +39,12 @@ class Stage:
     inputs: Mapping[str, SampleType]
     required: tuple[str, ...]
     outputs: Mapping[str, str]
-    process_logs: Callable[..., Iterable[tuple[str, int, bytes]]]
+    stream: Callable[..., Stream]
     findings: Callable[[Mapping], Sequence[str]] = _no_findings
-    configure: Callable[["Stage", object], tuple["Stage", list]] | None = None
+    configure: Callable[["Stage", str | Path | None], tuple["Stage", list]] | None = None
     unusable: str = ""
 
-    def prepare(self, params_file=None) -> tuple["Stage", list]:
+    def prepare(self, params_file: str | Path | None = None) -> tuple["Stage", list]:
         """(Stage, parameters) under a parameter file, or None for defaults.
 
         Raises:
@@ -54,7 +54,7 @@ class Stage:
             return self.configure(self, params_file)
         return self, self.read_params(params_file)
 
-    def read_params(self, params_file=None) -> list:
+    def read_params(self, params_file: str | Path | None = None) -> list:
         """The objects of ``params`` in a parameter file (or None: defaults)."""
         params = parameters_for(self.params + self.node_params, self.node, params_file)
         return params[:len(self.params)]
@@ -77,6 +77,8 @@ class StageReport:
         skipped: why it did not run, empty if it did.
         summary: a line of text; ``results``: plain numbers of what it found; ``remarks``: texts on
             what makes them doubtful.
+        findings: texts on what looks wrong with the samples; ``warnings``: on what the estimator
+            met.
     """
 
     node: str
@@ -88,3 +90,5 @@ class StageReport:
     summary: str = ""
     results: dict = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)

@@ -1,21 +1,24 @@
 """Estimators between messages: CDR bytes in, CDR bytes out. Nothing here knows rclpy.
 
-A :class:`Stream` decodes, guards and merges; a subclass says which topics it takes,
-hands samples to its estimator and emits what that says. Nodes add DDS to it, batch
-adds recordings.
+A :class:`Stream` takes *blocks*: whatever waits on all its topics, one message while a live node
+is idle, thousands in a replay or in batch. It decodes, guards and merges them as arrays; a
+subclass says which topics it takes, hands samples to its estimator and makes messages of what
+that says. What comes out does not depend on how the samples were cut into blocks. Nodes add
+DDS to it, batch adds recordings.
 """
 
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from imu_fusion.errors import MessageError
 from imu_fusion.messages.convert import SampleType
+from imu_fusion.messages.layouts import Decoded
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.samples.logs import Log
-from imu_fusion.samples.merge import RESTART, SampleStream
+from imu_fusion.samples.blocks import BlockMerger, Samples, joined
+from imu_fusion.samples.guard import Guard, Verdict
 
 
 @dataclass(frozen=True)
@@ -27,116 +30,187 @@ class EstimatorNodeParams(Parameters):
                          "repeats of what was lost. In a replay they are always reliable.")
 
 
+class Messages(NamedTuple):
+    """Messages of one topic, in order: stamps (n,) int64 ns, a list of CDR bytes."""
+
+    topic: str
+    stamp: np.ndarray
+    cdrs: list[bytes]
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What a stream says after the last sample of a whole recording.
+
+    ``made``: further lists of Messages; ``results``: plain numbers; ``summary``: a line of text;
+    ``remarks``: texts on what makes the numbers doubtful.
+    """
+
+    made: Iterable[list[Messages]] = ()
+    results: Mapping[str, Any] = field(default_factory=dict)
+    summary: str = ""
+    remarks: Sequence[str] = ()
+
+
+def one_by_one(made: Iterable[Messages]) -> Iterator[tuple[str, int, bytes]]:
+    """(topic, stamp, cdr) of Messages that belong together, in order of stamps, topics of one stamp
+    in the order given."""
+    made = list(made)
+    rows = [(stamp, k, i) for k, m in enumerate(made) for i, stamp in enumerate(m.stamp.tolist())]
+    for stamp, k, i in sorted(rows):
+        yield made[k].topic, stamp, made[k].cdrs[i]
+
+
 _LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
 
 
 class Stream:
-    """Messages of several topics to an estimator, as samples in order of their stamps.
+    """Messages of several topics through an estimator.
 
     Args:
         inputs: dict of topic to SampleType, in order of rank at equal stamps.
-        emit: called as ``emit(topic, stamp, cdr)`` with every message made.
         warn: called with a text when something is wrong with the input.
 
     Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement
-    ``restart`` (forget everything), ``take`` (one sample), ``flush`` (emit what is held back) and
-    ``look_at`` (texts about first samples).
+    ``restart`` (forget everything), ``use`` (samples of one epoch in, Messages out), ``flush``
+    (Messages of what is held back), and where they have something to say ``look_at`` (texts about
+    first samples) and ``conclude``.
     """
 
-    same_frame: tuple[str, ...] = ()
+    same_frame: ClassVar[tuple[str, ...]] = ()
+    #: To be set before the first sample where :meth:`conclude` is to be called: what that needs
+    #: is then kept.
+    concludes = False
 
     def __init__(self, inputs: Mapping[str, SampleType],
-                 emit: Callable[[str, int, bytes], object],
-                 warn: Callable[[str], object] = lambda text: None):
+                 warn: Callable[[str], object] = lambda text: None) -> None:
         self.inputs = inputs
-        self.emit = emit
         self.warn = warn
-        self.bad_messages = 0
-        self.merged = SampleStream(inputs, self._refused)
-        self._queue: deque[tuple] = deque()
+        self.undecodable: Counter[str] = Counter()
+        self._merger = BlockMerger({topic: kind.width for topic, kind in inputs.items()},
+                                   self._refused)
         self.reset()
 
-    def reset(self, session_topics: Sequence[str] | None = None) -> None:
+    def reset(self, session_topics: Container[str] | None = None) -> None:
         """Start over: with strict merging of these topics, or live (None)."""
-        self.merged.begin(session_topics)
-        self._queue.clear()
+        self._merger.begin(session_topics)
         self.frame_ids: dict[str, str] = {}
-        self._first: dict[str, list] = {topic: [] for topic in self.inputs}
+        self.restarts = 0
+        self._first: dict[str, list[Samples]] = {topic: [] for topic in self.inputs}
         self.restart()
 
-    def push(self, topic: str, cdr: bytes) -> None:
-        """Take the bytes of one message; what may happen now is queued for :meth:`step`."""
-        kind = self.inputs[topic]
-        try:
-            stamp, frame_id, values = kind.layout.decode(cdr)
-        except MessageError as error:
-            self.bad_messages += 1
-            self.warn(f"{topic}: message left out: {error}")
-            return
-        if topic not in self.frame_ids:
-            self.frame_ids[topic] = frame_id
-            self._compare_frames()
-        sample = kind.values(values)
-        if len(self._first[topic]) < _LOOK_AT:
-            self._first[topic].append((stamp, sample))
-            if len(self._first[topic]) == _LOOK_AT:
-                for text in self.look_at(topic, self._first_logs()):
-                    self.warn(text)
-        self._queue.extend(self.merged.add(topic, stamp, sample))
+    def take(self, blocks: Mapping[str, Sequence[bytes]]) -> list[Messages]:
+        """Take the CDR bytes of messages, by topic in order of arrival."""
+        return self.take_decoded({topic: self.inputs[topic].layout.decode_block(cdrs)
+                                  for topic, cdrs in blocks.items()})
 
-    def step(self) -> bool:
-        """Process one queued event; False if there is none."""
-        if not self._queue:
-            return False
-        topic, stamp, sample = self._queue.popleft()
-        if topic == RESTART:
-            self.warn("the clock was set back: the estimator starts anew")
-            self.flush()
-            self.restart()
-        else:
-            self.take(topic, stamp, sample)
-        return True
+    def take_decoded(self, blocks: Mapping[str, Decoded]) -> list[Messages]:
+        """:meth:`take` of messages that have been decoded already."""
+        samples = {}
+        for topic, block in blocks.items():
+            for reason in block.refused.values():
+                self.undecodable[topic] += 1
+                if _is_told(self.undecodable[topic]) and not self.concludes:
+                    self.warn(f"{topic}: message left out: {reason} "
+                              f"({self.undecodable[topic]} so far)")
+            if len(block.stamp):
+                if topic not in self.frame_ids:
+                    self.frame_ids[topic] = block.frame_ids[0]
+                    self._compare_frames()
+                samples[topic] = block.stamp, self.inputs[topic].values(block.values)
+                self._look(topic, *samples[topic])
+        return self._through(self._merger.add(samples))
 
-    def topic_ended(self, topic: str) -> None:
-        """Nothing more comes on this topic in this session."""
-        self._queue.extend(self.merged.end(topic))
+    def end(self, topics: Iterable[str]) -> list[Messages]:
+        """Nothing more comes on these topics in this session."""
+        return self._through(self._merger.end(topics))
 
-    def finish(self) -> None:
-        """The end of the session: everything that is held back is emitted."""
-        while self.step():
-            pass
-        self.flush()
+    def finish(self) -> list[Messages]:
+        """The end of the session: everything that is held back."""
+        return self.end(self.inputs) + self.flush()
+
+    @property
+    def guards(self) -> Mapping[str, Guard]:
+        """What was taken and refused, by topic."""
+        return self._merger.guards
+
+    def refused(self, topic: str) -> dict[str, int]:
+        """What was left out of a topic: reasons in words, and how many of each."""
+        refused = self.guards[topic].refused()
+        if self.undecodable[topic]:
+            refused["cannot be decoded"] = self.undecodable[topic]
+        return refused
+
+    @property
+    def held(self) -> int:
+        """Number of samples that wait for another topic."""
+        return self._merger.held
 
     def restart(self) -> None:
+        """Forget all samples; parameters stay."""
         raise NotImplementedError
 
-    def take(self, topic: str, stamp: int, sample: np.ndarray) -> None:
+    def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
+        """Samples of one epoch, all before those of the next call."""
         raise NotImplementedError
 
-    def flush(self) -> None:
+    def flush(self) -> list[Messages]:
+        """What is held back for samples that will not come."""
         raise NotImplementedError
 
-    def look_at(self, topic: str, logs: Mapping[str, Log]) -> list[str]:
+    def conclude(self) -> Conclusion:
+        """After :meth:`finish`, at the end of a whole recording."""
+        return Conclusion()
+
+    def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
         """Texts about the first samples of ``topic``; ``logs`` maps topics to what there is."""
         return []
 
-    def _first_logs(self):
-        logs = {}
-        for topic, rows in self._first.items():
-            if rows:
-                stamps, samples = zip(*rows)
-                logs[topic] = self.inputs[topic].log(np.array(stamps), np.array(samples),
-                                                     self.frame_ids[topic])
-        return logs
+    def _through(self, segments) -> list[Messages]:
+        made: list[Messages] = []
+        for segment in segments:
+            if segment.restart:
+                self.warn("the clock was set back: the estimator starts anew")
+                made += self.flush()
+                self.restarts += 1
+                self.restart()
+            made += self.use(segment.samples)
+        return made
 
-    def _refused(self, topic, stamp, verdict):
-        count = self.merged.guards[topic].counts[verdict]
-        if count in (1, 10, 100) or count % 1000 == 0:
-            self.warn(f"{topic}: sample at stamp {stamp} left out: {verdict.value} "
-                      f"({count} so far)")
+    def _look(self, topic: str, stamp: np.ndarray, values: np.ndarray) -> None:
+        """Have the first samples looked at, once there are enough of them."""
+        if self.concludes:
+            return    # whole logs are looked at instead
+        first = self._first[topic]
+        seen = sum(len(stamps) for stamps, _ in first)
+        if seen < _LOOK_AT:
+            first.append((stamp[:_LOOK_AT - seen], values[:_LOOK_AT - seen]))
+            if seen + len(stamp) >= _LOOK_AT:
+                for text in self.look_at(topic, self._first_logs()):
+                    self.warn(text)
 
-    def _compare_frames(self):
+    def _first_logs(self) -> dict[str, Any]:
+        return {topic: self.inputs[topic].log(*joined(parts), self.frame_ids[topic])
+                for topic, parts in self._first.items() if parts}
+
+    def _refused(self, topic: str, stamps: np.ndarray, verdicts: Sequence[Verdict]) -> None:
+        if self.concludes:
+            return    # told in the end, in a table
+        counts = self._merger.guards[topic].counts
+        for verdict in dict.fromkeys(verdicts):
+            count, here = counts[verdict], verdicts.count(verdict)
+            if any(_is_told(k) for k in range(count - here + 1, count + 1)):
+                stamp = int(stamps[verdicts.index(verdict)])
+                self.warn(f"{topic}: sample at stamp {stamp} left out: {verdict.value} "
+                          f"({count} so far)")
+
+    def _compare_frames(self) -> None:
         frames = {t: f for t, f in self.frame_ids.items() if t in self.same_frame}
         if len(set(frames.values())) > 1:
             named = ", ".join(f"{topic} in '{frame}'" for topic, frame in frames.items())
             self.warn(f"sensors name different frames ({named}): their axes are taken as parallel")
+
+
+def _is_told(count: int) -> bool:
+    """Whether the count-th of equal faults is worth a line: the first ones, then ever fewer."""
+    return count in (1, 10, 100) or count % 1000 == 0

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
-from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.messages import convert
 from imu_fusion.messages.layouts import FIX, IMU, POSE, TWIST
 from imu_fusion.messages.typestore import TYPES
@@ -15,12 +15,13 @@ STAMP = 1_700_000_123_456_789_012
 
 def test_orientation_covariance_is_about_world_axes_in_the_message():
     """A sensor with x up (pitch -90 deg) that is unsure about its own x is unsure of yaw."""
-    row = np.zeros(1, ORIENTATION_DTYPE)[0]
+    rows = np.zeros(1, ORIENTATION_DTYPE)
+    row = rows[0]
     row["stamp"] = STAMP
     row["quat_world_imu"] = Rotation.from_euler("y", -90, degrees=True).as_quat()
     row["cov_attitude"] = np.diag([4.0, 1.0, 1.0])
     row["gyr"], row["acc"] = (1, 2, 3), (4, 5, 6)
-    cdr = convert.orientation_message(row, "ball")
+    (cdr,) = convert.orientation_messages(rows, "ball", np.array([True]))
     message = TYPES.deserialize_cdr(cdr, IMU.msgtype)
     np.testing.assert_allclose(message.orientation_covariance.reshape(3, 3),
                                np.diag([1.0, 1.0, 4.0]), atol=1e-15)
@@ -83,9 +84,9 @@ def test_bool_is_what_rosbags_writes():
 
 
 def test_orientation_rows_give_roll_pitch_yaw():
-    row = np.zeros(1, ORIENTATION_DTYPE)[0]
-    row["quat_world_imu"] = Rotation.from_euler("ZYX", [0.3, -0.2, 0.1]).as_quat()
-    message = TYPES.deserialize_cdr(convert.rpy_message(row, "x"),
+    rows = np.zeros(1, ORIENTATION_DTYPE)
+    rows["quat_world_imu"] = Rotation.from_euler("ZYX", [0.3, -0.2, 0.1]).as_quat()
+    message = TYPES.deserialize_cdr(convert.rpy_messages(rows, "x")[0],
                                     "geometry_msgs/msg/Vector3Stamped")
     np.testing.assert_allclose([message.vector.x, message.vector.y, message.vector.z],
                                [0.1, -0.2, 0.3], atol=1e-15)

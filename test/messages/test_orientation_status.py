@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import MessageError
-from imu_fusion.estimation.orientation import state as st
-from imu_fusion.estimation.orientation.estimator import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation import rows as st
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.streams import orientation as orientation_stream
+from imu_fusion.streams.stream import one_by_one
 from imu_fusion.messages.orientation_status import (
     WORDS, bias_message, bias_values, flags_message, flags_value, lasting_flags)
 
@@ -25,12 +26,11 @@ def test_bytes_that_are_no_flags_are_refused():
 def test_a_disturbance_lasts_until_the_next_magnetometer_sample():
     """Imu rows between two magnetometer samples say nothing of the field."""
     rows = [st.FLAG_MAG_USED, st.FLAG_MAG_DISTURBED, 0, st.FLAG_SATURATED, st.FLAG_MAG_USED, 0]
-    got, flags = [], 0
-    for row in rows:
-        flags = lasting_flags(row, flags)
-        got.append(flags)
     d = st.FLAG_MAG_DISTURBED
-    assert got == [0, d, d, d | st.FLAG_SATURATED, 0, 0]
+    expected = [0, d, d, d | st.FLAG_SATURATED, 0, 0]
+    assert lasting_flags(np.array(rows), 0).tolist() == expected
+    for cut in range(1, len(rows)):
+        assert lasting_flags(np.array(rows[cut:]), expected[cut - 1]).tolist() == expected[cut:]
 
 
 def test_bias_and_its_deviation_survive_the_message():
@@ -50,7 +50,8 @@ def test_flags_come_when_they_change_and_biases_ten_times_a_second():
     rows["flags"][150:300] |= st.FLAG_STILL
     writer = orientation_stream._Writer(orientation_stream.OrientationParams(),
                                         orientation_stream.OrientationOutputParams())
-    messages = list(writer.messages(rows, "imu"))
+    messages = list(one_by_one(writer.messages(rows[:170], "imu")
+                               + writer.messages(rows[170:], "imu")))
     flags = [flags_value(cdr) for topic, _, cdr in messages if topic == "imu/flags"]
     s, r = st.FLAG_SATURATED, st.FLAG_STILL
     assert flags == [(0, 0), (1_000_000_000, s), (1_500_000_000, s | r), (2_000_000_000, r),

@@ -35,7 +35,7 @@ class Graph:
     def start(self, cls, **parameters):
         """One of our nodes with ROS parameters, as from the command line."""
         return self.add(cls(parameter_overrides=[
-            Parameter(name.replace("__", "."), value=value)
+            Parameter(name, value=value)
             for name, value in parameters.items()]))
 
     def close(self, node):

@@ -1,15 +1,20 @@
 """Parameters of nodes from dataclasses, and diagnostics."""
 
+import importlib
+import math
 from dataclasses import dataclass
 
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.exceptions import ParameterUninitializedException
-from rclpy.parameter import Parameter
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import Parameter, parameter_value_to_python
 
 from imu_fusion.errors import ParameterError, TopicError
+from imu_fusion.nodes import NODES
 from imu_fusion.nodes.base import Node, message_class, run_node
 from imu_fusion.parameters.declare import Parameters, param
+from test.nodes.conftest import write_bag
 
 
 @dataclass(frozen=True)
@@ -23,8 +28,25 @@ class Numbers(Parameters):
 
 
 @dataclass(frozen=True)
+class Initial(Parameters):
+    mode: str = param("still", doc="how to start", choices=("still", "given"))
+
+
+@dataclass(frozen=True)
 class More(Parameters):
-    initial__mode: str = param("still", doc="how to start", choices=("still", "given"))
+    initial: Initial = Initial()
+
+
+FOUR = {"accelerometers.names": ["a", "b", "c", "d"], "accelerometers.a.position": [0.1, 0.0, 0.0],
+        "accelerometers.b.position": [0.0, 0.1, 0.0], "accelerometers.c.position": [0.0, 0.0, 0.1],
+        "accelerometers.d.position": [-0.1, -0.1, 0.0]}
+
+
+def node_class(name):
+    module = importlib.import_module(f"imu_fusion.nodes.{name}")
+    (found,) = [v for v in vars(module).values() if isinstance(v, type)
+                and issubclass(v, Node) and v.__module__ == module.__name__]
+    return found
 
 
 class Example(Node):
@@ -44,10 +66,10 @@ def test_defaults_without_any_parameter(graph):
 
 def test_given_values_of_both_dataclasses(graph):
     node = graph.start(Example, gain=4.5, window=7, axis=[1.0, 0.0, 0.0], names=["a", "b"],
-                       fast=True, initial__mode="given", origin=1.5)
+                       fast=True, origin=1.5, **{"initial.mode": "given"})
     assert node.params(Numbers) == Numbers(gain=4.5, window=7, axis=(1.0, 0.0, 0.0),
                                            names=("a", "b"), fast=True, origin=1.5)
-    assert node.params(More).initial__mode == "given"
+    assert node.params(More).initial.mode == "given"
     assert node.get_parameter("origin").value == 1.5
 
 
@@ -59,12 +81,59 @@ def test_an_integer_is_a_float_where_one_is_wanted(graph):
     assert node.params(Numbers).axis == (1.0, 0.0, 0.0)
 
 
-def test_unset_parameters_have_a_type_and_no_value(graph):
+def test_unset_parameters_have_a_type_and_a_value_that_says_so(graph):
     node = graph.start(Example)
-    with pytest.raises(ParameterUninitializedException):
-        node.get_parameter("origin")
+    assert math.isnan(node.get_parameter("origin").value)
     assert node.describe_parameter("origin").type == Parameter.Type.DOUBLE.value
-    assert node.params(Numbers).names == ()
+    assert node.get_parameter("names").value == [""]
+    assert node.params(Numbers).names == () and node.params(Numbers).origin is None
+    again = graph.start(Example, origin=float("nan"), names=[""])
+    assert again.params(Numbers) == Numbers()
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_all_parameters_can_be_read_at_once_dumped_and_loaded_back(graph, tmp_path, name):
+    """As `ros2 param dump` does it: a request for every name, a file of the answers."""
+    cls = node_class(name)
+    given = {"bag": str(write_bag(tmp_path / "bag", 3)), "out": str(tmp_path / "out")}
+    given = {key: value for key, value in given.items()
+             if any(key == info.name for c in cls.PARAMETERS for info in c.infos())}
+    if name == "acceleration_field_estimator":
+        given |= FOUR
+    node = graph.start(cls, **given)
+    client = graph.node("reader").create_client(GetParameters, f"/{name}/get_parameters")
+    graph.until(client.service_is_ready)
+    names = [n for n in node._parameters if not n.startswith(("use_sim", "start_type"))]
+    future = client.call_async(GetParameters.Request(names=names))
+    graph.until(future.done)
+    assert len(future.result().values) == len(names) > 1
+    dumped = {n: parameter_value_to_python(v) for n, v in zip(names, future.result().values)}
+    dumped = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in dumped.items()}
+    file = tmp_path / "dump.yaml"
+    file.write_text(yaml.safe_dump({f"/{name}": {"ros__parameters": dumped}}))
+    params = {c: node.params(c) for c in cls.PARAMETERS}
+    graph.close(node)
+    if "out" in given:
+        dumped["out"] = str(tmp_path / "other")
+        file.write_text(yaml.safe_dump({f"/{name}": {"ros__parameters": dumped}}))
+    again = graph.add(cls(params_files=[str(file)], cli_args=[
+        "--ros-args", "--params-file", str(file)]))
+    for c in cls.PARAMETERS:
+        assert {k: v for k, v in again.params(c).to_mapping().items() if k != "out"} == {
+            k: v for k, v in params[c].to_mapping().items() if k != "out"}
+
+
+def test_a_node_takes_the_file_that_launch_ros_makes_of_a_list(graph, tmp_path):
+    file = tmp_path / "launch_params_x"
+    file.write_text(yaml.dump({"/**": {"ros__parameters": {"axis": (0.0, 1.0, 0.0)}}}))
+    node = graph.add(Example(params_files=[str(file)],
+                             cli_args=["--ros-args", "--params-file", str(file)]))
+    assert node.params(Numbers).axis == (0.0, 1.0, 0.0)
+
+
+def test_integer_ranges_fit_what_editors_take(graph):
+    node = graph.start(Example)
+    assert node.describe_parameter("window").integer_range[0].to_value == 2**31 - 1
 
 
 def test_descriptors_carry_meaning_bounds_and_read_only(graph):
@@ -82,7 +151,7 @@ def test_descriptors_carry_meaning_bounds_and_read_only(graph):
     ({"window": 2.5}, "'window'.*2.5 is not an integer"),
     ({"axis": [1.0, 2.0]}, "'axis'.*has 2 elements"),
     ({"fast": 1}, "'fast'.*1 is not true or false"),
-    ({"initial__mode": "x"}, "'initial.mode'.*one of still, given"),
+    ({"initial.mode": "x"}, "'initial.mode'.*one of still, given"),
     ({"gian": 1.0}, r"unknown parameter 'gian'; known: .*gain.*\(from node example\)"),
 ])
 def test_bad_values_are_refused_with_name_value_and_bounds(graph, given, text):
@@ -108,12 +177,13 @@ def test_use_sim_time_is_left_to_rclpy(graph):
 
 def test_diagnostics_carry_the_node_and_its_values(graph):
     got = []
-    graph.node("monitor").create_subscription(DiagnosticArray, "diagnostics", got.append, 10)
+    graph.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", got.append, 10)
     node = graph.start(Example)
-    node.start_diagnostics(lambda: (b"\1", "late", {"delay": 0.5}))
+    node.start_diagnostics("clock", lambda: (b"\1", "late", {"delay": 0.5}))
     graph.until(lambda: got)
     status, = got[0].status
-    assert (status.name, status.level, status.message) == ("example", b"\1", "late")
+    assert (status.name, status.level, status.message) == ("example: clock", b"\1", "late")
+    assert status.hardware_id == "imu_fusion"
     assert [(v.key, v.value) for v in status.values] == [("delay", "0.5")]
 
 

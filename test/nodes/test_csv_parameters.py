@@ -3,9 +3,9 @@
 import rclpy
 import yaml
 
-from imu_fusion.recordings.csv_import import import_csv
 from imu_fusion.nodes import acceleration_field_estimator
 from imu_fusion.nodes.acceleration_field_estimator import AccelerationFieldEstimatorNode
+from imu_fusion.recordings.csv_import import import_csv
 from test.recordings.test_csv_import import describe, write
 
 
@@ -25,7 +25,7 @@ def test_a_node_takes_the_parameter_file_of_a_table(tmp_path):
         assert set(config.accelerometers) == {"on", "y", "n", "top"}
         assert config.accelerometers["on"].position == (0.15, 0.0, 0.0)
         assert config.accelerometers["top"].measured_axes == ("x", "y")
-        assert config.gyroscope is not None and config.field.sample_rate == 100.0
+        assert config.field.use_gyro and config.field.sample_rate == 100.0
         node.destroy_node()
     finally:
         rclpy.try_shutdown()

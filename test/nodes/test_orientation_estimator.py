@@ -15,15 +15,15 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import ParameterError
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, MAG, VECTOR3
 from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value
-from imu_fusion.streams.orientation import OUTPUTS as TYPES
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode, transform
 from imu_fusion.nodes.replayer import Replayer
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.streams.orientation import OUTPUTS as TYPES
 from test.nodes.conftest import START, STEP, collector
 
 OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool,
@@ -75,14 +75,14 @@ def fields(topic, cdr):
     return stamp, frame_id, values.tobytes()
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.4])
-def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_path, lag):
+@pytest.mark.parametrize("told", [{}, {"lag": 0.4}], ids=["causal", "with a lag"])
+def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_path, told):
     bag = write(tmp_path / "bag", *recording)
     params = tmp_path / "params.yaml"
-    params.write_text(f"orientation_estimator:\n  ros__parameters:\n    lag: {lag}\n")
+    params.write_text(yaml.safe_dump({"orientation_estimator": {"ros__parameters": told}}))
     batch.process(bag, tmp_path / "out", params)
     sink = collector(graph, topics=OUTPUTS)
-    graph.start(OrientationEstimatorNode, qos="reliable", lag=lag)
+    graph.start(OrientationEstimatorNode, qos="reliable", **told)
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
     graph.until(lambda: replayer.finished and sink.ended)
     with open_bag(tmp_path / "out") as reader:
@@ -94,7 +94,7 @@ def test_nodes_and_batch_give_the_same_fields_bit_for_bit(graph, recording, tmp_
             if topic == "/imu/data":
                 assert len(offline) == len(recording[0]) - 2
             if topic == "/imu/data_smoothed":
-                assert len(offline) == (len(recording[0]) - 2 if lag else 0)
+                assert len(offline) == (len(recording[0]) - 2 if told else 0)
 
 
 def test_a_gyroscope_alone_gives_orientation_and_says_what_is_absent(graph, recording, tmp_path):
@@ -194,13 +194,13 @@ def test_diagnostics_say_what_was_left_out(graph, recording):
 
     def told():
         return any({v.key: v.value for v in s.values}.get("imu/data_raw repeated stamp") == "1"
-                   for s in said if s.name == "orientation_estimator")
+                   for s in said if s.name == "orientation_estimator: samples")
     graph.until(told)
 
 
 @pytest.mark.parametrize("parameters, words", [
     (dict(method="magic"), "'method'.*'magic'"), (dict(nosie=1.0), "unknown parameter 'nosie'"),
-    (dict(mag_noise_sd=-1.0), "'mag_noise_sd'.*out of bounds"),
+    ({"sensor.mag_noise_sd": -1.0}, "'sensor.mag_noise_sd'.*out of bounds"),
 ])
 def test_bad_parameters_are_refused_by_name(graph, parameters, words):
     with pytest.raises(ParameterError, match=words):
@@ -285,13 +285,14 @@ def test_calibration_answers_as_yaml_and_is_used(graph, recording):
     graph.until(lambda: raw.get_subscription_count())
     for i in range(len(mag)):
         raw.publish(mag_message(int(mag.stamp[i]), "ball", mag.mag[i] + [1e-5, 0.0, -5e-6]))
-    guard = estimator._stream.merged.guards["imu/mag"]
-    graph.until(lambda: sum(guard.counts.values()) == len(mag))
+    graph.until(lambda: sum(
+        estimator._stream.guards["imu/mag"].counts.values()) == len(mag))
     response = graph.call(node, Trigger, "/orientation_estimator/calibrate_magnetometer")
     assert response.success, response.message
     found = yaml.safe_load(response.message)
-    assert found["mag_offset"] == pytest.approx([1e-5, 0.0, -5e-6], abs=1e-6)
-    assert estimator._stream.estimator.params.mag_offset == tuple(found["mag_offset"])
+    assert found["sensor.mag_offset"] == pytest.approx([1e-5, 0.0, -5e-6], abs=1e-6)
+    assert estimator._stream.estimator.params.sensor.mag_offset == tuple(
+        found["sensor.mag_offset"])
 
 
 def test_gravity_is_removed_when_asked(graph):
@@ -306,8 +307,8 @@ def test_gravity_is_removed_when_asked(graph):
 
 def test_bias_estimation_is_switched_at_run_time_and_method_is_not(graph):
     estimator, _, publish = still(graph)
-    off, = estimator.set_parameters([Parameter("estimate_bias", value=False)])
-    assert off.successful and not estimator._stream.estimator.params.estimate_bias
+    off, = estimator.set_parameters([Parameter("fusion.estimate_bias", value=False)])
+    assert off.successful and not estimator._stream.estimator.params.fusion.estimate_bias
     publish(10)
     other, = estimator.set_parameters([Parameter("method", value="gyro_mag")])
     assert not other.successful

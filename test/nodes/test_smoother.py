@@ -10,15 +10,14 @@ from std_srvs.srv import Trigger
 
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
-from imu_fusion.streams.smoother import (
-    OUTPUTS, RESULTS_TOPIC, Collection, newest_epoch, results_value)
 from imu_fusion.nodes.flow import END
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.streams.smoother import OUTPUTS, RESULTS_TOPIC, SmootherStream, results_value
 from test.nodes.conftest import START, STEP, collector
 
 TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix": NavSatFix,
@@ -136,29 +135,31 @@ def test_a_second_call_is_refused_and_clear_empties(graph, tmp_path):
     assert not second.result().success and "already running" in second.result().message
     graph.until(first.done, 120.0)
     assert first.result().success
-    assert smoother._collection.counts()["imu/data_raw"] == 600
+    assert smoother._stream.counts()["imu/data_raw"] == 600
     assert graph.call(node, Trigger, "/smoother/clear").success
-    assert smoother._collection.counts()["imu/data_raw"] == 0
+    assert smoother._stream.counts()["imu/data_raw"] == 0
 
 
 def test_collection_is_bounded_and_says_so():
     said = []
-    collection = Collection(limit=56 * 10, warn=said.append)
-    for i in range(15):
-        collection.push("imu/data_raw", imu_message(START + i * STEP, "car", [0, 0, 0], [0, 0, 9]))
-    assert collection.counts()["imu/data_raw"] == 10 and collection.dropped == 5
+    stream = SmootherStream(limit=56 * 10, warn=said.append)
+    for first in (0, 9):
+        stream.take({"imu/data_raw": [
+            imu_message(START + i * STEP, "car", [0, 0, 0], [0, 0, 9])
+            for i in range(first, first + 9 - first // 3)]})
+    assert stream.counts()["imu/data_raw"] == 10 and stream.dropped == 5
     assert len(said) == 1 and "memory_limit" in said[0]
     with pytest.raises(EstimationError, match="5 samples were dropped"):
-        collection.logs()
+        stream.logs()
 
 
 def test_a_clock_set_back_drops_what_was_before_it():
-    collection = Collection(limit=1e6)
-    for stamp in (10, 11, 12, 3, 4):
-        collection.push("imu/data_raw",
-                        imu_message(stamp * 10**9, "car", [0, 0, 0], [0, 0, 9]))
-    collection.push("fix", fix_message(11 * 10**9, "gnss", 47.0, 11.0, 600.0))
-    logs = collection.logs()
-    assert list(logs["imu/data_raw"][0].stamp) == [3 * 10**9, 4 * 10**9]
+    stream = SmootherStream()
+    stream.take({"fix": [fix_message(11 * 10**9, "gnss", 47.0, 11.0, 600.0)]})
+    stream.take({"imu/data_raw": [imu_message(stamp * 10**9, "car", [0, 0, 0], [0, 0, 9])
+                                  for stamp in (10, 11, 12, 3, 4)]})
+    assert stream.counts() == {"imu/data_raw": 2, "imu/mag": 0, "fix": 0, "fix_velocity": 0}
     with pytest.raises(EstimationError, match="no samples on fix since the clock was set back"):
-        newest_epoch(logs)
+        stream.logs()
+    stream.take({"fix": [fix_message(4 * 10**9, "gnss", 47.0, 11.0, 600.0)]})
+    assert list(stream.logs()["imu/data_raw"].stamp) == [3 * 10**9, 4 * 10**9]

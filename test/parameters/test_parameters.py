@@ -3,10 +3,16 @@
 from dataclasses import dataclass
 
 import pytest
+import yaml
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.parameters.file import parameters_for
 from imu_fusion.parameters.declare import Parameters, markdown_table, param
+from imu_fusion.parameters.file import load, parameters_for
+
+
+@dataclass(frozen=True)
+class Initial(Parameters):
+    mode: str = param("rest", choices=("rest", "given"), doc="Start.")
 
 
 @dataclass(frozen=True)
@@ -16,8 +22,9 @@ class Example(Parameters):
     method: str = param("fusion", choices=("fusion", "gyro_mag"), doc="Method.")
     active: bool = param(True, doc="Switch.")
     limits: tuple[float, ...] | None = param(None, length=3, low=0.0, doc="Limits.")
-    initial__mode: str = param("rest", choices=("rest", "given"), doc="Start.")
+    ranges: tuple[float, ...] | None = param(None, length=(1, 3), low=0.0, doc="Ranges.")
     surface: str = param("", path=True, doc="File.")
+    initial: Initial = Initial()
 
 
 @dataclass(frozen=True)
@@ -29,7 +36,7 @@ def test_values_are_converted_and_dotted_names_reach_their_fields():
     example = Example.from_mapping({"noise": 1, "limits": [1, 2, 3], "initial": {"mode": "given"}})
     assert example.noise == 1.0 and isinstance(example.noise, float)
     assert example.limits == (1.0, 2.0, 3.0)
-    assert example.initial__mode == "given"
+    assert example.initial.mode == "given"
     assert Example.from_mapping(example.to_mapping()) == example
 
 
@@ -47,12 +54,19 @@ def test_values_are_converted_and_dotted_names_reach_their_fields():
     ({"limits": [1.0, 2.0]}, "'limits'.*has 2 elements.*3 elements"),
     ({"limits": [1.0, 2.0, -1.0]}, "'limits'.*out of bounds"),
     ({"limits": 4.0}, "'limits'.*not a list of float"),
+    ({"ranges": [1.0, 2.0]}, "'ranges'.*has 2 elements.*1 or 3 elements"),
+    ({"ranges": "3"}, "'ranges'.*not a list of float"),
+    ({"ranges": True}, "'ranges'.*not a list of float"),
     ({"initial": {"mode": "fast"}}, "'initial.mode'.*rest, given"),
     ({"nosie": 0.1}, "unknown parameter 'nosie'.*known: .*noise"),
 ])
 def test_bad_values_are_refused_with_name_value_and_bounds(values, words):
     with pytest.raises(ParameterError, match=words):
         Example.from_mapping(values, source="file.yaml")
+
+
+def test_a_number_is_a_list_where_one_stands_for_all():
+    assert Example.from_mapping({"ranges": 4}).ranges == (4.0,)
 
 
 def test_a_parameter_without_default_is_required():
@@ -76,8 +90,10 @@ def test_dataclass_is_checked_however_it_is_made():
 def test_file_of_ros_parameters_with_wildcard_and_namespace(tmp_path):
     (tmp_path / "hill.yaml").touch()
     file = tmp_path / "p.yaml"
-    file.write_text("/**:\n  ros__parameters:\n    noise: 0.5\n    somebody: 1\n    use_sim_time: true\n"
-                    "/robot/estimator:\n  ros__parameters:\n    count: 7\n    speed: 2.0\n    surface: hill.yaml\n"
+    file.write_text("/**:\n  ros__parameters:\n    noise: 0.5\n    somebody: 1\n"
+                    "    use_sim_time: true\n"
+                    "/robot/estimator:\n  ros__parameters:\n    count: 7\n    speed: 2.0\n"
+                    "    surface: hill.yaml\n"
                     "other:\n  ros__parameters: {x: 1}\n")
     example, other = parameters_for([Example, Other], "estimator", file)
     assert other.speed == 2.0
@@ -106,3 +122,11 @@ def test_table_lists_every_parameter_with_unit_and_bounds():
     table = markdown_table(Example)
     assert "| `noise` | 0.001 | rad/s | 0 to 1 | Noise. |" in table
     assert "| `limits` | unset |" in table and "`initial.mode`" in table
+
+
+def test_a_file_as_launch_ros_writes_it_is_read(tmp_path):
+    """launch_ros dumps its lists as tuples, with a tag of Python's."""
+    path = tmp_path / "launch_params.yaml"
+    path.write_text(yaml.dump({"/**": {"ros__parameters": {"axis": (1.0, 2.0), "names": ("a",)}}}))
+    assert "!!python/tuple" in path.read_text()
+    assert load(path) == {"**": {"axis": [1.0, 2.0], "names": ["a"]}}

@@ -7,9 +7,9 @@ from click.testing import CliRunner
 
 from imu_fusion import batch, cli
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.messages.layouts import IMU
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.csv_import import import_csv
-from imu_fusion.messages.layouts import IMU
 
 G = 9.80665
 SPIN = 5.0  # rad/s about the vertical
@@ -129,8 +129,10 @@ for _k, _name in enumerate(FLAT["accelerometers"]):
 
 
 @pytest.mark.parametrize("description, replace, words", [
-    (sensor(columns=["front_x", "front_y", "nope"]), None, "no column 'nope'; there are: t, front_x"),
-    (sensor(columns=["front_x", "front_y"]), None, "front: 2 columns for the measured axes x, y, z"),
+    (sensor(columns=["front_x", "front_y", "nope"]), None,
+     "no column 'nope'; there are: t, front_x"),
+    (sensor(columns=["front_x", "front_y"]), None,
+     "front: 2 columns for the measured axes x, y, z"),
     (without("columns"), None, "front: 'columns' must list"),
     (sensor(unit="gee"), None, "accelerometers.front.*'gee'.*one of m/s\\^2, g, mg"),
     (sensor(positon=[1, 2, 3]), None, "unknown parameter 'positon'.*accelerometers.front"),

@@ -61,11 +61,11 @@ def recording(tmp_path_factory):
             cov = np.diag([1e-2] * 3 + [1.0] * 3)
             writer.write("/" + ACCEL_TOPIC, ACCEL.msgtype, ACCEL.encode(
                 stamp, "body", np.concatenate([body, [0, 0, ALPHA], cov.ravel()])), stamp)
-    sensors = {name: {"position": list(map(float, place)), "range": 1000.0}
+    sensors = {name: {"position": list(map(float, place)), "range": [1000.0]}
                for name, place in PLACES.items()}
     sensors["b"]["axes"] = AXES_B.ravel().tolist()
     parameters = {"accelerometers": {"names": list(PLACES), **sensors},
-                  "gyroscope": {"range": LIMIT}, "points": list(POINT), "sample_rate": 1000.0}
+                  "use_gyro": True, "sensor": {"gyro_range": [LIMIT]}, "points": list(POINT), "sample_rate": 1000.0}
     (folder / "p.yaml").write_text(yaml.safe_dump(
         {"acceleration_field_estimator": {"ros__parameters": parameters}}))
     return folder / "bag", folder / "p.yaml"

@@ -103,5 +103,5 @@ def test_running_set_is_balanced_and_agrees_with_batch():
 def test_result_is_valid_as_parameters():
     c = calibrate_magnetometer(distorted(sphere(300, np.random.default_rng(1))), field_norm=NORM)
     p = OrientationParams.from_mapping(c.to_parameters())
-    assert p.mag_offset == pytest.approx(OFFSET, abs=1e-11)
-    assert np.reshape(p.mag_matrix, (3, 3)) == pytest.approx(SOFT, abs=1e-6)
+    assert p.sensor.mag_offset == pytest.approx(OFFSET, abs=1e-11)
+    assert np.reshape(p.sensor.mag_matrix, (3, 3)) == pytest.approx(SOFT, abs=1e-6)

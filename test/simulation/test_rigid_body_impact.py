@@ -5,8 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
-                                                     ImpactScene, contact_shape_factor, simulate)
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_PARTICLE,
+    PAPER_POSITIONS,
+    ImpactScene,
+    contact_shape_factor,
+    simulate,
+)
 
 
 @pytest.fixture(scope="module")

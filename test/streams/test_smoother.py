@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from imu_fusion import batch
 from imu_fusion.errors import MessageError
 from imu_fusion.evaluation.consistency import nees
+from imu_fusion.messages.layouts import ODOMETRY
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.messages.layouts import ODOMETRY
 from imu_fusion.streams.smoother import ODOMETRY_TOPIC, RESULTS_TOPIC, results_value
 
 ROOT = Path(__file__).parent.parent.parent

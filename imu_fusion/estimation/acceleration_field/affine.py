@@ -8,27 +8,65 @@ Lie-Stoermer-Verlet step (3.15)-(3.17) or, with higher order, from the rates at 
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+
+from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ACC,
+    ACC_RATE,
+    ALPHA,
+    BIAS,
+    JERK,
+    OMEGA,
+    THETA,
+    gap_variance,
+)
+from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
+from imu_fusion.estimation.acceleration_field.rows import (
+    GAP,
+    HELD,
+    MISSING,
+    ROW,
+    SATURATED,
+    put_row,
+    rigid_gradient,
+)
+from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
+from imu_fusion.estimation.acceleration_field.start import Start
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_to_matrix,
+    right_jacobian,
+    skew,
+)
 from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.acceleration_field.kernel import gap_variance
-from imu_fusion.estimation.acceleration_field.rows import (GAP, HELD, MISSING, SATURATED, VALUES,
-                                                           put_row, rigid_gradient)
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
-                                          right_jacobian, skew)
+#: What is carried from sample to sample, body axes: quaternion of the world from the body; omega,
+#: alpha and acc of the latest sample, alpha of the one before; length of the step between them, s;
+#: samples since the start or a gap; stamp, ns, negative before the first. ``cov`` is that of the
+#: state of motion_model, but for alpha and acc of the latest fit alone.
+STATE = np.dtype([
+    ("quat", "f8", 4), ("omega", "f8", 3), ("alpha", "f8", 3), ("alpha_before", "f8", 3),
+    ("acc", "f8", 3), ("step", "f8"), ("count", "i8"), ("last", "i8"),
+    ("cov", "f8", (BIAS, BIAS))])
 
-AO, SQRT_AO = 0, 1
-# Layout of the state vector: quaternion, omega, alpha of this and of the previous sample, a,
-# previous step in s, samples since the start or a gap.
-QUAT, RATE, ALPHA, ALPHA_BEFORE, ACC, STEP, COUNT = 0, 4, 7, 10, 13, 16, 17
-STATE = 18
+
+class Operator(NamedTuple):
+    """The least-squares fit of the twelve unknowns (a, alpha, S) with certain channels."""
+
+    matrix: np.ndarray   # (12, m), unknowns from readings
+    cov: np.ndarray      # (12, 12) of the unknowns
+    determined: bool     # whether a and alpha are
+    full: bool           # whether all unknowns are
 
 
 @njit
 def fit_operator(design, weight, used, max_condition):
-    """(12, m) operator of the least-squares fit with the channels used, its (12, 12) covariance
-    for unit weights and whether it determines a and alpha.
+    """The :class:`Operator` of the channels used.
 
     design: (m, 12) with columns scaled to comparable size, weight: (m,) 1/sd, used: (m,) bool.
     """
@@ -54,7 +92,7 @@ def fit_operator(design, weight, used, max_condition):
     for c in range(m):
         operator[:, c] *= weight[c]
     full = len(s) == 12 and s[-1] * max_condition > s[0]
-    return operator, inverse @ inverse.T, determined, full
+    return Operator(operator, inverse @ inverse.T, determined, full)
 
 
 @njit
@@ -73,16 +111,15 @@ def square_root_rate(symmetric, towards):
 
 
 @njit
-def _integrate_rate(state, alpha, dt, high_order):
-    """omega at the new sample; alpha (3,) there."""
-    before = state[ALPHA:ALPHA + 3]
-    if not high_order or state[COUNT] < 2.0:
-        return state[RATE:RATE + 3] + 0.5 * dt * (before + alpha)
+def _integrate_rate(s, alpha, dt, high_order):
+    """omega at the new sample; s: the STATE before it, alpha: (3,) there."""
+    if not high_order or s.count < 2:
+        return s.omega + 0.5 * dt * (s.alpha + alpha)
     # Parabola through the last three alpha, integrated over the last step (Adams-Moulton with
     # unequal steps).
-    ratio = dt / state[STEP]
-    slope = (alpha - before) - ratio * (before - state[ALPHA_BEFORE:ALPHA_BEFORE + 3])
-    return (state[RATE:RATE + 3] + 0.5 * dt * (before + alpha)
+    ratio = dt / s.step
+    slope = (alpha - s.alpha) - ratio * (s.alpha - s.alpha_before)
+    return (s.omega + 0.5 * dt * (s.alpha + alpha)
             - dt * ratio / (6.0 * (1.0 + ratio)) * slope)
 
 
@@ -97,28 +134,32 @@ def _rotation(dt, omega0, omega1, alpha0, alpha1, high_order):
 
 @njit
 def _grow(cov, dt, phi, cov_alpha):
-    """Covariance of attitude and omega (the first six of cov) over a step, white alpha errors."""
-    f = np.eye(6)
-    f[:3, :3] = quat_to_matrix(quat_exp(phi)).T
-    f[:3, 3:] = dt * right_jacobian(phi)
-    cov[:6, :6] = f @ cov[:6, :6].copy() @ f.T
-    cov[3:6, 3:6] += dt * dt * cov_alpha
+    """Covariance of theta and omega over a step of rotation phi (3,); alpha's errors are white."""
+    f = np.eye(ALPHA)
+    f[:OMEGA, :OMEGA] = quat_to_matrix(quat_exp(phi)).T
+    f[:OMEGA, OMEGA:] = dt * right_jacobian(phi)
+    cov[:ALPHA, :ALPHA] = f @ cov[:ALPHA, :ALPHA].copy() @ f.T
+    cov[OMEGA:ALPHA, OMEGA:ALPHA] += dt * dt * cov_alpha
 
 
 @njit
-def _fit(operator, design, sd, used, reading):
-    """The twelve unknowns (scaled as the design is) and the rms of what they leave over in units
-    of the noise, NaN where nothing can be left over."""
-    fit = np.zeros(12)
+def _fit(operator, design, sd, used, reading, unknowns):
+    """Fit the twelve unknowns (scaled as the design is), in place; returns the rms of what they
+    leave over in units of the noise, NaN where nothing can be left over."""
+    unknowns[:] = 0.0
     for c in range(len(sd)):
         if used[c]:
-            fit += operator[:, c] * reading[c]
+            for i in range(12):
+                unknowns[i] += operator.matrix[i, c] * reading[c]
     misfit, count = 0.0, 0
     for c in range(len(sd)):
         if used[c]:
             count += 1
-            misfit += ((reading[c] - np.sum(design[c] * fit)) / sd[c]) ** 2
-    return fit, math.sqrt(misfit / (count - 12)) if count > 12 else math.nan
+            expected = 0.0
+            for i in range(12):
+                expected += design[c, i] * unknowns[i]
+            misfit += ((reading[c] - expected) / sd[c]) ** 2
+    return math.sqrt(misfit / (count - 12)) if count > 12 else math.nan
 
 
 @njit
@@ -133,93 +174,101 @@ def _symmetric_part(fit):
 
 
 @njit
-def advance(state, cov, last, stamp, readings, design, scale, density, sample_rate,
-            reference, gravity, specific_force, method, high_order, max_gap, max_condition,
-            values, flags):
-    """Take samples in order; one row of values and flags each.
+def advance(state, par, channels, design, stamp, readings, rows):
+    """Take n samples in order, in place; one of ``rows`` (n,) ROW each.
 
-    state: (18,), cov: (18, 18) as in the rigid-body kernel but for alpha and a of the latest fit
-    alone, last: (1,) int64 stamp, all in place.
-    readings: (n, m) channels, NaN for missing and inf for saturated ones. design: (m, 12), its
-    columns multiplied by scale (12,).
+    state: (1,) STATE, par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, design:
+    (m, 12), its columns multiplied by ``scale`` of par. stamp: (n,) int64 ns. readings: (n, m),
+    NaN for missing and inf for saturated ones.
     """
-    m = readings.shape[1]
+    s, p = state[0], par[0]
+    m = len(channels)
+    sd = np.empty(m)
+    for c in range(m):
+        sd[c] = channels[c].density * math.sqrt(p.sample_rate)
     used = np.ones(m, np.bool_)
-    sd = density * math.sqrt(sample_rate)
-    operator, covariance, determined, full = fit_operator(
-        design, 1.0 / sd, used, max_condition)
+    operator = fit_operator(design, 1.0 / sd, used, p.max_condition)
     current = used.copy()
-    x = np.zeros(18)
+    unknowns = np.empty(12)
     for n in range(len(stamp)):
-        flag = 0
-        for c in range(m):
-            z = readings[n, c]
-            used[c] = math.isfinite(z)
-            if math.isnan(z):
-                flag |= MISSING
-            elif not used[c]:
-                flag |= SATURATED
+        row = rows[n]
+        row.stamp = stamp[n]
+        row.flags = _find_used(readings[n], used)
         if np.any(used != current):
             current[:] = used
-            operator, covariance, determined, full = fit_operator(
-                design, 1.0 / sd, used, max_condition)
-        dt = 0.0 if last[0] < 0 else (stamp[n] - last[0]) * 1e-9
-        if dt > max_gap:
-            # Nothing is integrated across a gap.
-            flag |= GAP
-            turned, speed2 = gap_variance(state[RATE:RATE + 3], dt)
-            for i in range(3):
-                cov[i, i] += turned
-                cov[3 + i, 3 + i] += speed2
-            state[COUNT] = 0.0
+            operator = fit_operator(design, 1.0 / sd, used, p.max_condition)
+        dt = 0.0 if s.last < 0 else (stamp[n] - s.last) * 1e-9
+        if dt > p.gap.max:
+            row.flags |= GAP
+            _cross_gap(s, dt)
             dt = 0.0
-        first = state[COUNT] == 0.0
-        residual = math.nan
-        if determined:
-            fit, residual = _fit(operator, design, sd, used, readings[n])
-            fit *= scale
-            alpha = fit[3:6].copy()
-            cov_alpha = covariance[3:6, 3:6] * np.outer(scale[3:6], scale[3:6])
+        row.residual_rms = math.nan
+        if operator.determined:
+            row.residual_rms = _fit(operator, design, sd, used, readings[n], unknowns)
+            unknowns *= p.scale
         else:
-            flag |= HELD
-            fit = np.zeros(12)
-            alpha = state[ALPHA:ALPHA + 3].copy()
-            cov_alpha = cov[6:9, 6:9].copy()
-        symmetric = _symmetric_part(fit)
-        omega = state[RATE:RATE + 3].copy()
-        if not first:
-            omega = _integrate_rate(state, alpha, dt, high_order)
-        if method == SQRT_AO and determined and full:
-            omega = square_root_rate(symmetric, omega)
-        if not first:
-            phi = _rotation(dt, state[RATE:RATE + 3], omega, state[ALPHA:ALPHA + 3], alpha,
-                            high_order)
-            state[QUAT:QUAT + 4] = quat_normalize(quat_multiply(state[QUAT:QUAT + 4],
-                                                                quat_exp(phi)))
-            _grow(cov, dt, phi, cov_alpha)
-        if method == SQRT_AO and determined and full:
-            _set_rate_covariance(cov, omega, covariance, scale)
-        if determined:
-            acc = fit[0:3].copy()
-            gradient = symmetric + skew(alpha) if full else rigid_gradient(omega, alpha)
-            cov[12:15, 12:15] = covariance[0:3, 0:3]
-            cov[6:9, 6:9] = cov_alpha
+            row.flags |= HELD
+        _move(s, p, operator, unknowns, dt)
+        s.last = stamp[n]
+        if operator.determined and operator.full:
+            gradient = _symmetric_part(unknowns) + skew(s.alpha)
         else:
-            acc = state[ACC:ACC + 3].copy()
-            gradient = rigid_gradient(omega, alpha)
-        state[ALPHA_BEFORE:ALPHA_BEFORE + 3] = state[ALPHA:ALPHA + 3]
-        state[ALPHA:ALPHA + 3] = alpha
-        state[RATE:RATE + 3] = omega
-        state[ACC:ACC + 3] = acc
-        state[STEP] = dt
-        state[COUNT] += 1.0
-        last[0] = stamp[n]
-        x[3:6] = omega
-        x[6:9] = alpha
-        x[12:15] = acc
-        put_row(values[n], gradient, x, cov, state[QUAT:QUAT + 4], reference, gravity,
-                specific_force, residual)
-        flags[n] = flag
+            gradient = rigid_gradient(s.omega, s.alpha)
+        # Whole slices: plain arrays, for which put_row is compiled in any case.
+        put_row(row, p, s.quat[:], s.omega[:], s.alpha[:], s.acc[:], s.cov[:], gradient)
+
+
+@njit
+def _find_used(reading, used):
+    """Which channels of a sample can be used, in place; returns the flags of the others."""
+    flags = 0
+    for c in range(len(used)):
+        used[c] = math.isfinite(reading[c])
+        if math.isnan(reading[c]):
+            flags |= MISSING
+        elif not used[c]:
+            flags |= SATURATED
+    return flags
+
+
+@njit
+def _cross_gap(s, dt):
+    """Nothing is integrated across a gap."""
+    turned, speed2 = gap_variance(s.omega, dt)
+    for i in range(3):
+        s.cov[THETA + i, THETA + i] += turned
+        s.cov[OMEGA + i, OMEGA + i] += speed2
+    s.count = 0
+
+
+@njit
+def _move(s, p, operator, unknowns, dt):
+    """Take the STATE to the next sample, dt s later, of which the twelve unknowns were fitted."""
+    cov = s.cov[:]
+    alpha, acc = s.alpha.copy(), s.acc.copy()
+    if operator.determined:
+        acc, alpha = unknowns[0:3].copy(), unknowns[3:6].copy()
+        scale = p.scale[3:6]
+        cov[ACC:ACC_RATE, ACC:ACC_RATE] = operator.cov[0:3, 0:3]
+        cov[ALPHA:JERK, ALPHA:JERK] = operator.cov[3:6, 3:6] * np.outer(scale, scale)
+    omega = s.omega.copy()
+    if s.count > 0:
+        omega = _integrate_rate(s, alpha, dt, p.high_order)
+    by_root = p.square_root and operator.determined and operator.full
+    if by_root:
+        omega = square_root_rate(_symmetric_part(unknowns), omega)
+    if s.count > 0:
+        phi = _rotation(dt, s.omega, omega, s.alpha, alpha, p.high_order)
+        s.quat[:] = quat_normalize(quat_multiply(s.quat, quat_exp(phi)))
+        _grow(cov, dt, phi, cov[ALPHA:JERK, ALPHA:JERK])
+    if by_root:
+        _set_rate_covariance(cov, omega, operator.cov, p.scale)
+    s.alpha_before[:] = s.alpha
+    s.alpha[:] = alpha
+    s.omega[:] = omega
+    s.acc[:] = acc
+    s.step = dt
+    s.count += 1
 
 
 @njit
@@ -234,39 +283,39 @@ def _set_rate_covariance(cov, omega, covariance, scale):
         largest = max(largest, covariance[i, i] * scale[i] * scale[i])
     speed2 = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
     variance = largest / (4.0 * max(speed2, 0.5 * math.sqrt(largest)))
-    cov[3:6, :6] = 0.0
-    cov[:6, 3:6] = 0.0
+    cov[OMEGA:ALPHA, :ALPHA] = 0.0
+    cov[:ALPHA, OMEGA:ALPHA] = 0.0
     for i in range(3):
-        cov[3 + i, 3 + i] = variance
+        cov[OMEGA + i, OMEGA + i] = variance
 
 
 class AffineFilter:
     """AO or sqrt-AO with a start: biases are subtracted, attitude and rate are integrated."""
 
-    def __init__(self, params, layout, start):
-        x, cov, quat = start
-        self._params = params
-        self._layout = layout
-        self._bias = x[18:]
-        self._scale = np.r_[np.ones(3), np.full(9, 1.0 / layout.radius)]
-        self._design = np.ascontiguousarray(layout.design * self._scale)
-        state = np.zeros(STATE)
-        state[QUAT:QUAT + 4] = quat
-        state[RATE:RATE + 3] = x[3:6]
-        self.state = {"state": state, "cov": np.zeros((18, 18)),
-                      "last": np.array([-1], dtype=np.int64)}
-        self.state["cov"][:6, :6] = cov[:6, :6]
+    def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start):
+        self._par = kernel_params(params, array)
+        self._channels = array.channels
+        self._bias = start.x[BIAS:]
+        self._design = np.ascontiguousarray(array.design * self._par["scale"][0])
+        self.state = np.zeros(1, STATE)
+        self.state["quat"] = start.quat
+        self.state["omega"] = start.x[OMEGA:ALPHA]
+        self.state["last"] = -1
+        self.state["cov"][0, :ALPHA, :ALPHA] = start.cov[:ALPHA, :ALPHA]
 
-    def process(self, stamp, readings):
-        """Rows' values (n, 71) and flags (n,) of samples: stamp (n,), readings (n, m)."""
-        p, l, s = self._params, self._layout, self.state
-        values = np.empty((len(stamp), VALUES))
-        flags = np.empty(len(stamp), dtype=np.uint32)
+    def get_state(self) -> np.ndarray:
+        """A copy of the memory, for :meth:`set_state`."""
+        return self.state.copy()
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Go on from where :meth:`get_state` was called."""
+        self.state = state.copy()
+
+    def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
+        """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
+        rows = np.empty(len(stamp), ROW)
         # Saturation is judged on what the sensor said, before its bias is taken off.
-        clipped = np.abs(readings) >= l.range
+        clipped = np.abs(readings) >= self._channels["range"]
         corrected = np.where(clipped, np.inf, readings - self._bias)
-        advance(s["state"], s["cov"], s["last"], stamp, corrected, self._design, self._scale,
-                l.density, p.sample_rate, l.reference, p.gravity, l.specific_force,
-                SQRT_AO if p.method == "sqrt_ao" else AO, p.integration == "high_order",
-                p.max_gap, p.max_condition, values, flags)
-        return values, flags
+        advance(self.state, self._par, self._channels, self._design, stamp, corrected, rows)
+        return rows

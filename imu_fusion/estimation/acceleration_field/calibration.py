@@ -9,6 +9,7 @@ as given.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import least_squares
 
@@ -31,12 +32,12 @@ class ArrayCalibration:
     residual: np.ndarray
     disagreement: np.ndarray
 
-    def apply(self, readings):
+    def apply(self, readings: np.ndarray) -> np.ndarray:
         """Readings (n, N, 3) in the sensors' axes to the axes of the first sensor."""
         return np.einsum("kij,nkj->nki", self.matrix, readings - self.bias)
 
 
-def calibrate_array(poses, gravity=9.80665):
+def calibrate_array(poses: ArrayLike, gravity: float = 9.80665) -> ArrayCalibration:
     """Calibrate from the mean readings of still poses.
 
     Args:

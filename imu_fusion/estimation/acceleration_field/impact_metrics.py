@@ -6,8 +6,10 @@ y right, z down).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import StateSpace, butter, lsim, sosfiltfilt
 
@@ -23,22 +25,31 @@ J211_FROM_REP103 = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class ImpactParams(Parameters):
-    """When an event begins and how its signals are treated; 0 as trigger finds none."""
+    """``impact.*``: when an event begins and how its signals are treated."""
 
-    impact__trigger: float = param(98.0665, unit="m/s^2", low=0,
-                           doc="Linear acceleration at the first point that begins an event; "
-                               "0: no events.")
-    impact__before: float = param(0.02, unit="s", low=0, doc="Kept before the trigger.")
-    impact__duration: float = param(0.2, unit="s", low=1e-3, doc="Whole length of an event.")
-    impact__linear_class: int | None = param(
-        None, doc="Channel class (60, 180, 600 or 1000) of linear accelerations; unset: as is.")
-    impact__angular_class: int | None = param(
-        None, doc="Channel class of angular rates and accelerations; unset: as is.")
-    impact__axes: str = param("rep103", choices=("rep103", "j211"),
-                      doc="Axes of the body: x forward with y left, z up, or y right, z down.")
+    detect: bool = param(
+        True, doc="Whether impacts are looked for and measured. Set it to false for motions that "
+                  "have none, such as shaking by hand.")
+    trigger: float = param(
+        98.0665, unit="m/s^2", low=1e-3,
+        doc="Linear acceleration at the first point that begins an event. Lower it to catch light "
+            "impacts, raise it where ordinary motion reaches it.")
+    before: float = param(
+        0.02, unit="s", low=0.0, doc="How much of what precedes the trigger belongs to the event.")
+    duration: float = param(
+        0.2, unit="s", low=1e-3, doc="Whole length of an event. Raise it for soft surfaces.")
+    linear_class: int | None = param(
+        None, doc="Channel class (60, 180, 600 or 1000, SAE J211) of linear accelerations; unset: "
+                  "unfiltered. Set it to compare with laboratories.")
+    angular_class: int | None = param(
+        None, doc="Channel class of angular rates and accelerations; unset: unfiltered.")
+    axes: str = param(
+        "rep103", choices=("rep103", "j211"),
+        doc="Axes of the body: x forward with y left, z up, or y right, z down. Metrics that tell "
+            "axes apart (BrIC, DAMAGE) need it.")
 
 
-def channel_filter(values, rate, channel_class):
+def channel_filter(values: ArrayLike, rate: float, channel_class: int) -> np.ndarray:
     """Zero-phase filter of a channel frequency class, SAE J211-1 appendix C.
 
     A Butterworth filter of second order, run forwards and backwards, whose corner lies at
@@ -66,7 +77,8 @@ def channel_filter(values, rate, channel_class):
     return sosfiltfilt(butter(2, corner, fs=rate, output="sos"), values, axis=0, padlen=pad)
 
 
-def hic(t, acceleration, longest):
+def hic(t: np.ndarray, acceleration: np.ndarray, longest: float) -> tuple[
+        float, float, float]:
     """Head injury criterion: the largest ``(t2 - t1) mean(a / g)^2.5`` over intervals of at most
     ``longest`` s (FMVSS 208; HIC15 and HIC36 for 0.015 and 0.036).
 
@@ -92,7 +104,8 @@ def hic(t, acceleration, longest):
     return best
 
 
-def sustained_level(t, magnitude, duration=0.003, cumulative=False):
+def sustained_level(t: np.ndarray, magnitude: np.ndarray, duration: float = 0.003,
+                    cumulative: bool = False) -> float:
     """The level that a piecewise linear signal exceeds for ``duration`` s: 3 ms clip.
 
     Args:
@@ -129,7 +142,7 @@ def _longest_above(t, y, level, cumulative):
     return longest
 
 
-def bric(omega):
+def bric(omega: np.ndarray) -> float:
     """Brain injury criterion of Takhounts et al. 2013 (Stapp 57): omega (n, 3) rad/s, J211 axes.
 
     Critical rates 66.25, 56.45 and 42.87 rad/s, the averages for strain and its cumulative
@@ -138,14 +151,14 @@ def bric(omega):
     return float(np.linalg.norm(np.abs(omega).max(axis=0) / (66.25, 56.45, 42.87)))
 
 
-def gambit(acceleration, alpha):
+def gambit(acceleration: ArrayLike, alpha: ArrayLike) -> float:
     """Generalised acceleration model of Newman 1986: the largest
     ``((a / 250 g)^2.5 + (alpha / 25000)^2.5)^(1 / 2.5)``; magnitudes (n,), m/s^2 and rad/s^2."""
     ratio = (np.asarray(acceleration) / (250 * STANDARD_GRAVITY), np.asarray(alpha) / 25000.0)
     return float(np.max((ratio[0] ** 2.5 + ratio[1] ** 2.5) ** (1 / 2.5)))
 
 
-def damage(t, alpha):
+def damage(t: np.ndarray, alpha: np.ndarray) -> float:
     """DAMAGE of Gabler, Crandall, Panzer 2019: the largest deflection of three coupled
     oscillators driven by the angular acceleration.
 
@@ -163,7 +176,7 @@ def damage(t, alpha):
     return float(2.9903 * np.linalg.norm(deflection, axis=1).max())
 
 
-def find_events(t, magnitude, params):
+def find_events(t: np.ndarray, magnitude: np.ndarray, params: ImpactParams) -> list[slice]:
     """Slices of the events: each from ``before`` ahead of a crossing of ``trigger``, over
     ``duration``; a crossing inside an event belongs to it.
 
@@ -172,22 +185,21 @@ def find_events(t, magnitude, params):
         magnitude: (n,) m/s^2.
         params: ImpactParams.
     """
-    if params.impact__trigger == 0:
-        return []
-    above = magnitude >= params.impact__trigger
+    above = magnitude >= params.trigger
     crossings = np.flatnonzero(above & ~np.r_[False, above[:-1]])
     events, end = [], -np.inf
     for k in crossings:
         if t[k] <= end:
             continue
-        begin = t[k] - params.impact__before
-        end = begin + params.impact__duration
+        begin = t[k] - params.before
+        end = begin + params.duration
         events.append(slice(int(np.searchsorted(t, begin)),
                             int(np.searchsorted(t, end, side="right"))))
     return events
 
 
-def measure_impacts(rows, points, gravity, params=ImpactParams()):
+def measure_impacts(rows: np.ndarray, points: ArrayLike, gravity: float,
+                    params: ImpactParams = ImpactParams()) -> list[dict[str, Any]]:
     """Metrics of every event in the rows of an acceleration field estimator.
 
     The linear acceleration is the kinematic one. Events are found at the first point, before
@@ -207,20 +219,20 @@ def measure_impacts(rows, points, gravity, params=ImpactParams()):
     Raises:
         SampleError: a rate too low for the channel class.
     """
-    if len(rows) < 3:
+    if len(rows) < 3 or not params.detect:
         return []
     t = (rows["stamp"] - rows["stamp"][0]) * 1e-9
     step = np.median(np.diff(t))
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     points = points if len(points) else np.zeros((1, 3))
-    to_j211 = J211_FROM_REP103 if params.impact__axes == "rep103" else np.eye(3)
+    to_j211 = J211_FROM_REP103 if params.axes == "rep103" else np.eye(3)
     acc = field_at(rows, points, gravity)[1] @ to_j211
     events = find_events(t, np.linalg.norm(acc[:, 0], axis=1), params)
     omega, alpha = rows["omega"] @ to_j211, rows["alpha"] @ to_j211
-    if params.impact__linear_class is not None:
-        acc = channel_filter(acc, 1 / step, params.impact__linear_class)
-    if params.impact__angular_class is not None:
-        omega, alpha = (channel_filter(v, 1 / step, params.impact__angular_class)
+    if params.linear_class is not None:
+        acc = channel_filter(acc, 1 / step, params.linear_class)
+    if params.angular_class is not None:
+        omega, alpha = (channel_filter(v, 1 / step, params.angular_class)
                         for v in (omega, alpha))
     results = []
     for number, event in enumerate(events):
@@ -234,9 +246,9 @@ def measure_impacts(rows, points, gravity, params=ImpactParams()):
                     rows["stamp"][event][0]), "point": [float(v) for v in point],
                 **({"refused": refused} if refused else
                    _metrics(t[event], acc[event, k], omega[event], alpha[event])),
-                "linear_class": params.impact__linear_class,
-                "angular_class": params.impact__angular_class,
-                "complete": bool(t[-1] - t[event][0] >= params.impact__duration - 1.5 * step),
+                "linear_class": params.linear_class,
+                "angular_class": params.angular_class,
+                "complete": bool(t[-1] - t[event][0] >= params.duration - 1.5 * step),
                 "saturated_samples": int(np.sum(rows["flags"][event] & SATURATED > 0)),
                 "missing_samples": int(np.sum(rows["flags"][event] & (MISSING | GAP) > 0)),
                 "axes": "j211"})

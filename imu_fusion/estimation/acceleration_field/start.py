@@ -1,98 +1,110 @@
-"""Where an acceleration field starts: given, or found while the body is still.
+"""Where an acceleration field starts: given, or found while the body is still."""
 
-A start is the mean x (18 + m,), the covariance and the quaternion of the state that
-:mod:`imu_fusion.estimation.acceleration_field.kernel` describes.
-"""
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.acceleration_field.kernel import (ACC, ALPHA, BIAS, OMEGA,
-                                                             motion_step)
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ACC,
+    ACC_RATE,
+    ALPHA,
+    BIAS,
+    OMEGA,
+    THETA,
+    motion_spread,
+    parts,
+)
+from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
+from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.geometry.rotation import skew
 
 # How well the still body's kinematic acceleration is known to be zero, m/s^2.
 _STILL_SD = 1e-3
 
 
-def given_start(params, layout):
+class Start(NamedTuple):
+    """The state before the first sample, see :mod:`.motion_model`."""
+
+    x: np.ndarray      # (18 + m,)
+    cov: np.ndarray    # (18 + m, 18 + m)
+    quat: np.ndarray   # (4,) world from body
+
+
+def given_start(params: AccelerationFieldParams, array: SensorArray) -> Start:
     """Start from ``initial.orientation`` and ``initial.angular_velocity``; the accelerations are
-    unknown and become known with the first sample. Returns (x, cov, quat)."""
-    m = len(layout.density)
-    x = np.zeros(BIAS + m)
-    x[OMEGA:OMEGA + 3] = params.initial__angular_velocity
+    unknown and become known with the first sample."""
+    initial = params.initial
+    x = np.zeros(BIAS + len(array.channels))
+    parts(x).omega[:] = initial.angular_velocity
     sd = np.concatenate([
-        np.full(3, params.initial__orientation_sd), np.full(3, params.initial__angular_velocity_sd),
-        np.repeat(motion_spread(params), 3), layout.bias_sd])
-    return x, np.diag(sd ** 2), normalized(params.initial__orientation)
+        np.full(3, initial.orientation_sd), np.full(3, initial.angular_velocity_sd),
+        np.repeat(motion_spread(params), 3), array.channels["bias_sd"]])
+    return Start(x, np.diag(sd ** 2), normalized(initial.orientation))
 
 
-def motion_spread(params):
-    """Standard deviations (4,) of alpha, its rate, a and its rate where nothing is known of them:
-    the processes of the model have run for a second. Wide, and free of a scale of its own."""
-    _, noise = motion_step(1.0, params.motion__rate)
-    jerk, acc = params.motion__jerk_density, params.motion__acceleration_rate_density
-    return np.array([jerk * np.sqrt(noise[2, 2]), jerk * np.sqrt(noise[3, 3]),
-                     acc + 10 * params.gravity, acc])
-
-
-def rest_start(params, layout, readings):
+def rest_start(params: AccelerationFieldParams, array: SensorArray,
+               readings: np.ndarray) -> Start:
     """Start from the readings (n, m) of a still body: tilt, zero rate, biases.
 
     The heading is that of ``initial.orientation``, with no uncertainty: the world is named by
     it. For accelerometers that report coordinate acceleration the whole orientation is given.
-    Returns (x, cov, quat); the part of the biases that cannot be told from the tilt stays
-    uncertain, correlated with it.
+    The part of the biases that cannot be told from the tilt stays uncertain, correlated with it.
     """
-    m = len(layout.density)
-    x, cov, quat = given_start(params, layout)
-    x[OMEGA:OMEGA + 3] = 0.0
-    still = np.r_[0:OMEGA, ALPHA:ACC, ACC + 3:BIAS]
+    channels = array.channels
+    m = len(channels)
+    x, cov, quat = given_start(params, array)
+    parts(x).omega[:] = 0.0
+    still = np.r_[THETA:OMEGA, ALPHA:ACC, ACC_RATE:BIAS]
     cov[still, :] = 0.0
     cov[:, still] = 0.0
-    seen = np.isfinite(readings) & (np.abs(readings) < layout.range)
+    seen = np.isfinite(readings) & (np.abs(readings) < channels["range"])
     number = seen.sum(axis=0)
     use = number > 0
     mean = np.where(seen, readings, 0.0).sum(axis=0)[use] / number[use]
     rows = np.zeros((m, BIAS + m))
     rows[:, BIAS:] = np.eye(m)
-    acc = ~layout.is_gyro
-    rows[acc, ACC:ACC + 3] = layout.direction[acc]
-    rows[acc, ALPHA:ALPHA + 3] = np.cross(layout.lever[acc], layout.direction[acc])
-    rows[layout.is_gyro, OMEGA:OMEGA + 3] = layout.direction[layout.is_gyro]
-    variance = ((params.noise_scale * layout.density[use]) ** 2 * params.sample_rate
+    gyro = channels["is_gyro"]
+    felt = channels[~gyro]
+    rows[~gyro, ACC:ACC_RATE] = felt["direction"]
+    rows[~gyro, ALPHA:ALPHA + 3] = np.cross(felt["lever"], felt["direction"])
+    rows[gyro, OMEGA:ALPHA] = channels["direction"][gyro]
+    variance = ((params.noise_scale * channels["density"][use]) ** 2 * params.sample_rate
                 / number[use])
     x, cov = _update(x, cov, rows[use], mean, np.diag(variance))
     constraint = np.zeros((3, BIAS + m))
-    constraint[:, ACC:ACC + 3] = np.eye(3)
+    constraint[:, ACC:ACC_RATE] = np.eye(3)
     target = np.zeros(3)
-    if layout.specific_force:
-        up = x[ACC:ACC + 3] / np.linalg.norm(x[ACC:ACC + 3])
+    if array.specific_force:
+        acc = parts(x).acc
+        up = acc / np.linalg.norm(acc)
         quat = _level(up, quat)
         target = params.gravity * up
         # Tilt unknown to a radian, heading known.
-        cov[:3, :3] = np.eye(3) - np.outer(up, up)
-        constraint[:, :3] = -skew(target)
+        cov[THETA:OMEGA, THETA:OMEGA] = np.eye(3) - np.outer(up, up)
+        constraint[:, THETA:OMEGA] = -skew(target)
     x, cov = _update(x, cov, constraint, target, np.eye(3) * _STILL_SD ** 2)
-    quat = (Rotation.from_quat(quat) * Rotation.from_rotvec(x[:3])).as_quat()
-    x[:3] = 0.0
-    return x, cov, quat
+    quat = (Rotation.from_quat(quat) * Rotation.from_rotvec(parts(x).theta)).as_quat()
+    parts(x).theta[:] = 0.0
+    return Start(x, cov, quat)
 
 
-def is_still(params, layout, readings):
+def is_still(params: AccelerationFieldParams, array: SensorArray, readings: np.ndarray) -> bool:
     """Whether every channel of ``readings`` (n, m) varies by less than ``initial.still_sd``
     (accelerometers) or ``initial.angular_velocity_sd`` plus noise (gyroscope)."""
-    seen = np.where(np.abs(readings) < layout.range, readings, np.nan)
+    channels = array.channels
+    seen = np.where(np.abs(readings) < channels["range"], readings, np.nan)
     use = np.isfinite(seen).sum(axis=0) > 1
     if not np.any(use):
         return False
-    noise = params.noise_scale * layout.density * np.sqrt(params.sample_rate)
-    limit = np.where(layout.is_gyro, params.initial__angular_velocity_sd,
-                     params.initial__still_sd) + 2 * noise
+    noise = params.noise_scale * channels["density"] * np.sqrt(params.sample_rate)
+    limit = np.where(channels["is_gyro"], params.initial.angular_velocity_sd,
+                     params.initial.still_sd) + 2 * noise
     return bool(np.all(np.nanstd(seen[:, use], axis=0) < limit[use]))
 
 
-def normalized(quat):
+def normalized(quat: Sequence[float]) -> np.ndarray:
     """A quaternion (4,) scaled to unit length."""
     quat = np.asarray(quat, dtype=float)
     return quat / np.linalg.norm(quat)

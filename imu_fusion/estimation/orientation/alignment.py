@@ -11,7 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.orientation import mag_limit as limit
+from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
+from imu_fusion.estimation.orientation.mag_rejection import are_saturated
+from imu_fusion.estimation.orientation.params import OrientationParams
+from imu_fusion.estimation.orientation.state import MAG_LIMIT
 from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
 from imu_fusion.sensors.saturation import saturated_axes
 
@@ -24,6 +27,7 @@ _STANDARD_GRAVITY = 9.80665
 # Field norms that differ by more than this factor from their median are outliers: hard iron
 # and motion change them by less.
 _NORM_FACTOR = 3.0
+_NO_FORCE = 1e-3           # m/s^2
 # Below this share of the field horizontal, heading is noise: the magnetic poles.
 _HORIZONTAL_SHARE = 0.02
 
@@ -51,7 +55,7 @@ class Alignment:
     gravity: float
 
 
-def triad(acc, mag, declination):
+def triad(acc: np.ndarray, mag: np.ndarray, declination: float) -> np.ndarray:
     """Initial orientation, eqs. (12)-(14).
 
     Args:
@@ -72,21 +76,20 @@ def triad(acc, mag, declination):
     return np.array([east, north, up])
 
 
-def usable_mags(mag, ranges):
+def usable_mags(mag: np.ndarray, par: np.ndarray) -> np.ndarray:
     """Mask (m,) of the samples of the first interval that measure the field.
 
     Left out are samples with an axis at its limit, also those before the limit was
     recognised, and outliers.
 
     Args:
-        mag: (m, 3) tesla, finite, as the sensor reports it. ranges: (3,) tesla or nan.
+        mag: (m, 3) tesla, finite, as the sensor reports it. par: of kernel_parameters.
     """
     if len(mag) == 0:
         return np.zeros(0, dtype=bool)
-    floats, ints = np.zeros(limit.FLOATS), np.zeros(limit.INTS, dtype=np.int64)
+    found = np.zeros(1, MAG_LIMIT)
     for _ in range(2):
-        usable = np.array([not limit.is_saturated(floats, ints, ranges, sample)
-                           for sample in mag])
+        usable = ~are_saturated(found, par, mag)
     norm = np.linalg.norm(mag, axis=1)
     if usable.any():
         median = np.median(norm[usable])
@@ -116,62 +119,28 @@ def _rotate_all(chain, vectors):
     return out
 
 
-def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr_density,
-          gyr_bias_sd, acc_bias_sd, mag_sd, gyr_limits=math.inf):
+def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: np.ndarray,
+          mag: np.ndarray, params: OrientationParams,
+          gyr_limits: float | np.ndarray = math.inf) -> Alignment:
     """Initial orientation, gyroscope bias and field from the first samples.
 
     Args:
         imu_stamps: (n,) int64 ns, n >= 1.
         gyr, acc: (n, 3) rad/s, m/s^2.
         mag_stamps, mag: (m,), (m, 3) tesla, calibrated; m may be 0.
-        declination, yaw_offset: rad; yaw_offset turns the result about up.
-        gyr_density: rad/s/sqrt(Hz).
-        gyr_bias_sd: rad/s, of a bias that was not seen at rest.
-        acc_bias_sd: m/s^2.
-        mag_sd: tesla, of one sample.
+        params: noise of the sensors, declination, and the yaw that turns the result about up.
         gyr_limits: rad/s, scalar or (3,). From a rate at its limit on nobody knows how the
             sensor turned: only samples before it are used.
 
     Returns:
         Alignment. Never raises for poor data: the covariance says how poor.
     """
-    n = len(imu_stamps)
-    duration = max((imu_stamps[-1] - imu_stamps[0]) * 1e-9, 1e-2)
-    rate_mean = gyr.mean(axis=0)
-    scatter = gyr.std(axis=0).max()
-    at_rest = bool(n > 2 and np.linalg.norm(rate_mean) < _BIAS_LIMIT
-                   and scatter < _REST_RATE_SCATTER
-                   and acc.std(axis=0).max() < _REST_ACC_SCATTER)
-    if at_rest:
-        bias = rate_mean
-        # Hands are never quite still: what the halves disagree by is not known as bias.
-        drift = np.abs(gyr[:n // 2].mean(axis=0) - gyr[n // 2:].mean(axis=0)).max()
-        bias_sd = math.hypot(gyr_density / math.sqrt(duration), 0.5 * drift)
-    else:
-        bias, bias_sd = np.zeros(3), gyr_bias_sd
+    p = params.sensor
+    at_rest, bias, bias_sd = _rest(imu_stamps, gyr, acc, p)
     lost = np.flatnonzero(saturated_axes(gyr, gyr_limits).any(axis=1))
-    used = max(int(lost[0]), 1) if len(lost) else n
+    used = max(int(lost[0]), 1) if len(lost) else len(gyr)
     chain = _chain(imu_stamps[:used], gyr[:used] - bias)
-
-    acc_first = _rotate_all(chain, acc[:used])
-    up_force = acc_first.mean(axis=0)
-    gravity = float(np.linalg.norm(up_force))
-    if gravity < 1e-3:
-        # Free fall or no accelerometer: any tilt is as good as any other.
-        up_force = np.array([0.0, 0.0, 1.0])
-        tilt_variance = 1.0
-    else:
-        # A quarter of the interval per independent mean: motion is correlated.
-        wander = acc_first.std(axis=0).max() / 2.0 if not at_rest else 0.0
-        excess = abs(gravity - _STANDARD_GRAVITY) if not at_rest else 0.0
-        if used < n:
-            # Too short to show how the force wanders: its norm does, whatever the attitude.
-            norm = np.linalg.norm(acc, axis=1)
-            wander = max(wander, math.sqrt(np.mean((norm - _STANDARD_GRAVITY) ** 2)))
-        tilt_variance = min((acc_bias_sd ** 2 + wander ** 2 + excess ** 2) / gravity ** 2, 1.0)
-        if not at_rest:
-            gravity = _STANDARD_GRAVITY    # what is seen is motion, too
-    up = up_force / np.linalg.norm(up_force)
+    up, gravity, tilt_variance = _tilt(chain, acc, at_rest, p.acc_bias_sd)
 
     nan = float("nan")
     field_first, inclination, field_norm, has_heading = None, nan, nan, False
@@ -184,15 +153,16 @@ def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr
         inclination = math.asin(np.clip(-(field_first @ up) / max(field_norm, 1e-30), -1, 1))
         has_heading = math.cos(inclination) > _HORIZONTAL_SHARE
     if has_heading:
-        r = triad(up, field_first, declination)
+        r = triad(up, field_first, math.radians(params.declination_deg or 0.0))
         horizontal = field_norm * math.cos(inclination)
-        heading_variance = ((mag_sd / horizontal) ** 2 / len(mag)
+        heading_variance = ((p.mag_noise_sd / horizontal) ** 2 / len(mag)
                             + math.tan(inclination) ** 2 * tilt_variance)
     else:
         # Yaw zero, x towards east; where x is near the vertical, y towards north.
         north = np.cross(up, [1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
         r = triad(up, north, 0.0)
-        heading_variance = math.pi ** 2 / 3.0   # uniform over the circle
+        heading_variance = UNIFORM_VARIANCE
+    yaw_offset = math.radians(params.alignment.yaw_offset_deg)
     c, s = math.cos(yaw_offset), math.sin(yaw_offset)
     r = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ r
     return Alignment(
@@ -201,3 +171,43 @@ def align(imu_stamps, gyr, acc, mag_stamps, mag, *, declination, yaw_offset, gyr
         field_world=None if field_first is None else r @ field_first,
         gyr_bias=bias, gyr_bias_sd=float(bias_sd), at_rest=at_rest, has_heading=has_heading,
         inclination=inclination, field_norm=field_norm, gravity=gravity)
+
+
+def _rest(stamps, gyr, acc, p):
+    """Whether the first interval is at rest, and the bias (3,) with its standard deviation."""
+    n = len(stamps)
+    duration = max((stamps[-1] - stamps[0]) * 1e-9, 1e-2)
+    mean = gyr.mean(axis=0)
+    at_rest = bool(n > 2 and np.linalg.norm(mean) < _BIAS_LIMIT
+                   and gyr.std(axis=0).max() < _REST_RATE_SCATTER
+                   and acc.std(axis=0).max() < _REST_ACC_SCATTER)
+    if not at_rest:
+        return at_rest, np.zeros(3), p.gyro_bias_sd
+    # Hands are never quite still: what the halves disagree by is not known as bias.
+    drift = np.abs(gyr[:n // 2].mean(axis=0) - gyr[n // 2:].mean(axis=0)).max()
+    return at_rest, mean, math.hypot(p.gyro_noise_density / math.sqrt(duration), 0.5 * drift)
+
+
+def _tilt(chain, acc, at_rest, acc_bias_sd):
+    """Up (3,) in the axes of the first sample, gravity (m/s^2), and the tilt's variance (rad^2).
+
+    chain: (k, 4) of :func:`_chain`, of the first samples alone where later ones are not to be used.
+    """
+    used = len(chain)
+    acc_first = _rotate_all(chain, np.ascontiguousarray(acc[:used]))
+    up_force = acc_first.mean(axis=0)
+    gravity = float(np.linalg.norm(up_force))
+    if gravity < _NO_FORCE:
+        # Free fall or no accelerometer: any tilt is as good as any other.
+        return np.array([0.0, 0.0, 1.0]), gravity, 1.0
+    # A quarter of the interval per independent mean: motion is correlated.
+    wander = acc_first.std(axis=0).max() / 2.0 if not at_rest else 0.0
+    surplus = abs(gravity - _STANDARD_GRAVITY) if not at_rest else 0.0
+    if used < len(acc):
+        # Too short to show how the force wanders: its norm does, whatever the attitude.
+        norm = np.linalg.norm(acc, axis=1)
+        wander = max(wander, math.sqrt(np.mean((norm - _STANDARD_GRAVITY) ** 2)))
+    variance = min((acc_bias_sd ** 2 + wander ** 2 + surplus ** 2) / gravity ** 2, 1.0)
+    # In motion what is seen is motion, too.
+    return (up_force / np.linalg.norm(up_force), gravity if at_rest else _STANDARD_GRAVITY,
+            variance)

@@ -1,69 +1,92 @@
-"""Error-state algebra of the fusion kernel: prediction, scalar updates, their adjoints.
+"""The error state of the fusion filter and its algebra: prediction, scalar updates, adjoints.
 
-The error state, in the order of the offsets below; attitude, velocity, position
-and field errors are in world axes, so that between corrections they couple through
-few terms:
+Attitude, velocity, position and field errors are in world axes, so that between corrections
+they couple through few terms:
 
-    dtheta' = R (dS gyr_raw - dbias + dexcess)      attitude, rad
+    dtheta' = R (dS gyr_raw - dbias + dclipped)     attitude, rad
     dv'     = -[R f]x dtheta - R dacc_bias          velocity, m/s
     dp'     = dv                                    position, m
 
-Gyroscope model: rate = gyr_raw + S gyr_raw - bias + excess, excess only on axes at
-their limit; there dexcess' = dsurge, dsurge' = -dsurge / time (Singer 1970).
-Magnetometer model, relative to the field's norm: ``m_true = m - C m - offset`` and
-``R m_true = field + local``, ``local`` being what distinguishes the place from its
-surroundings.
+Gyroscope model: rate = gyr_raw + S gyr_raw - bias + clipped. The clipped rate is what an axis at
+its limit does not show; there dclipped' = dacc, dacc' = -dacc / time with the angular
+acceleration acc (Singer 1970). Magnetometer model, relative to the field's norm:
+``m_true = m - C m - offset`` and ``R m_true = field + local field``, the local field being what
+distinguishes the place from its surroundings.
 
-A prediction is described by a few blocks instead of its full matrix (MOVE below);
+A prediction is described by a few blocks instead of its full matrix (PREDICTION);
 predictions and updates can be written to a tape, which the smoother reads backwards.
 """
+
+import math
 
 import numpy as np
 from imu_fusion.kernels import njit
 
-ATT, BIAS, SCALE, VEL, POS, FIELD, LOCAL, OFFSET, ACC_BIAS, LAG, SOFT, EXCESS, SURGE = (
-    0, 3, 6, 15, 18, 21, 24, 27, 30, 33, 34, 43, 46)
-N = 49
+# The first index of each part; the nominal values are fields of state.STATE.
+(ATTITUDE,      # (3,) rad, world axes
+ GYRO_BIAS,     # (3,) rad/s
+ GYRO_SCALE,    # (3, 3) row by row
+ VELOCITY,      # (3,) m/s, world axes
+ POSITION,      # (3,) m, world axes
+ FIELD,         # (3,) relative to the norm, world axes
+ LOCAL_FIELD,   # (3,) likewise
+ MAG_OFFSET,    # (3,) relative to the norm, imu axes
+ ACC_BIAS,      # (3,) m/s^2
+ MAG_LAG,       # s
+ MAG_MATRIX,    # (3, 3) row by row
+ CLIPPED_RATE,  # (3,) rad/s
+ ANGULAR_ACC,   # (3,) rad/s^2
+ N) = (0, 3, 6, 15, 18, 21, 24, 27, 30, 33, 34, 43, 46, 49)
 
-# One prediction: integrals over the block, as one float array.
-MOVE_TIME = 0
-MOVE_ROTATION = 1      # (3, 3) integral of R dt
-MOVE_SCALE = 10        # (3, 9) of R[:, i] gyr_raw[j] dt
-MOVE_FORCE = 37        # (3,) of R f dt
-MOVE_EXCESS = 40       # (3, 3) of R dt over axes at their limit
-MOVE_LOCAL_KEEP = 49   # factor that LOCAL keeps
-MOVE_EXCESS_KEEP = 50  # (3,) 1 where the axis was at its limit before, else 0
-MOVE_SURGE_KEEP = 53   # factor that SURGE keeps
-MOVE_SURGE_GAIN = 54   # s, of EXCESS per SURGE at the block's end
-MOVE_SURGE_MEAN = 55   # s, the same on average over the block
-MOVE_STATES = 56       # EXCESS if no axis is at its limit, else N: what comes later is zero
-MOVE_NOISE = 57        # (N,) diagonal of the process noise
-MOVE_SIZE = MOVE_NOISE + N
+UNIFORM_VARIANCE = math.pi ** 2 / 3.0   # rad^2, of an angle about which nothing is known
+ROW_WIDTH = 17     # most coefficients of one row: those of the magnetometer
+MAX_UPDATES = 15   # most updates of one block: three axes each of five measurements
 
-# One scalar update on the tape: count, indices, coefficients, gain, variance, residual.
-OP_WIDTH = 24          # largest number of coefficients
-OP_INDEX = 1
-OP_COEFFICIENT = OP_INDEX + OP_WIDTH
-OP_GAIN = OP_COEFFICIENT + OP_WIDTH
-OP_VARIANCE = OP_GAIN + N
-OP_RESIDUAL = OP_VARIANCE + 1
-OP_SIZE = OP_RESIDUAL + 1
-MAX_OPS = 16
+PREDICTION = np.dtype([
+    ("time", "f8"),                      # s, of the block
+    ("rotation", "f8", (3, 3)),          # integral of R dt
+    ("rotation_gyr", "f8", (3, 9)),      # of R[:, i] gyr_raw[j] dt
+    ("force", "f8", 3),                  # of R f dt
+    ("clipped_rotation", "f8", (3, 3)),  # of R dt over axes at their limit
+    ("local_field_keep", "f8"),          # factor that the local field keeps
+    ("stays_clipped", "f8", 3),          # 1 where the axis was at its limit before, else 0
+    ("acc_keep", "f8"),                  # factor that the angular acceleration keeps
+    ("rate_gain", "f8"),                 # s, of clipped rate per angular acceleration at the end
+    ("rate_mean", "f8"),                 # s, the same on average over the block
+    ("states", "i8"),   # CLIPPED_RATE if no axis is at its limit, else N: what follows is zero
+    ("noise", "f8", N),                  # diagonal of the process noise
+], align=True)
+"""One prediction: integrals over a block."""
 
-# One block on the tape.
-TAPE_OPS = 0
-TAPE_TURNED = 1        # 1 where the world's axes were turned: nothing passes back
-TAPE_MOVE = 2
-TAPE_COV = TAPE_MOVE + MOVE_SIZE
-TAPE_OP = TAPE_COV + N * N
-TAPE_SIZE = TAPE_OP + MAX_OPS * OP_SIZE
+ROW = np.dtype([
+    ("count", "i8"),                     # coefficients in use
+    ("index", "i8", ROW_WIDTH),          # of the error state
+    ("coefficient", "f8", ROW_WIDTH),
+    ("residual", "f8"),                  # measured less predicted from the nominal state
+    ("variance", "f8"),                  # of the noise
+], align=True)
+"""One scalar measurement: residual = sum_a coefficient[a] error[index[a]] + noise."""
 
+TAPE = np.dtype([
+    ("stamp", "i8"),                     # ns, of the block's end
+    ("row_end", "i8"),                   # output rows written up to there
+    ("turned", "?"),                     # the world's axes were turned: nothing passes back
+    ("prediction", PREDICTION),
+    ("cov", "f8", (N, N)),               # after the updates
+    ("count", "i8"),                     # updates in use, of each:
+    ("row", ROW, MAX_UPDATES),
+    ("gain", "f8", (MAX_UPDATES, N)),
+    ("total", "f8", MAX_UPDATES),        # variance of the innovation
+    ("innovation", "f8", MAX_UPDATES),
+], align=True)
+"""One block, for the smoother."""
 
 # States whose rows Phi, and Phi', change; those of axes at their limit come last.
-_MOVED = np.array([*range(ATT, BIAS), *range(VEL, FIELD), *range(LOCAL, OFFSET), *range(EXCESS, N)])
-_MOVED_BACK = np.array([*range(ATT, POS), *range(LOCAL, OFFSET), *range(ACC_BIAS, LAG),
-                        *range(EXCESS, N)])
-_LIMIT_STATES = N - EXCESS
+_MOVED = np.array([*range(ATTITUDE, GYRO_BIAS), *range(VELOCITY, FIELD),
+                   *range(LOCAL_FIELD, MAG_OFFSET), *range(CLIPPED_RATE, N)])
+_MOVED_BACK = np.array([*range(ATTITUDE, POSITION), *range(LOCAL_FIELD, MAG_OFFSET),
+                        *range(ACC_BIAS, MAG_LAG), *range(CLIPPED_RATE, N)])
+_LIMIT_STATES = N - CLIPPED_RATE
 
 
 @njit
@@ -75,71 +98,73 @@ def _add(out, factor, row, width):
 @njit
 def _moved(move, p, width, out):
     """Rows _MOVED of Phi p. p (N, width or more); out (len(_MOVED), width or more)."""
-    time = move[MOVE_TIME]
+    time, local_keep, acc_keep = move.time, move.local_field_keep, move.acc_keep
+    rate_gain, rate_mean = move.rate_gain, move.rate_mean
     for i in range(len(_MOVED)):
         for c in range(width):
             out[i, c] = p[_MOVED[i], c]
-    at_limit = move[MOVE_STATES] > EXCESS
+    at_limit = move.states > CLIPPED_RATE
     for i in range(3):
         turn, speed, place = out[i], out[3 + i], out[6 + i]
         push = np.zeros(width)
         for j in range(3):
-            r = move[MOVE_ROTATION + 3 * i + j]
-            _add(turn, -r, p[BIAS + j], width)
+            r = move.rotation[i, j]
+            _add(turn, -r, p[GYRO_BIAS + j], width)
             _add(push, -r, p[ACC_BIAS + j], width)
             if at_limit:
-                r = move[MOVE_EXCESS + 3 * i + j] * move[MOVE_EXCESS_KEEP + j]
-                _add(turn, r, p[EXCESS + j], width)
-                _add(turn, r * move[MOVE_SURGE_MEAN], p[SURGE + j], width)
+                r = move.clipped_rotation[i, j] * move.stays_clipped[j]
+                _add(turn, r, p[CLIPPED_RATE + j], width)
+                _add(turn, r * rate_mean, p[ANGULAR_ACC + j], width)
         for j in range(9):
-            _add(turn, move[MOVE_SCALE + 9 * i + j], p[SCALE + j], width)
+            _add(turn, move.rotation_gyr[i, j], p[GYRO_SCALE + j], width)
         # -[F]x p
         after, before = (i + 1) % 3, (i + 2) % 3
-        _add(push, -move[MOVE_FORCE + after], p[ATT + before], width)
-        _add(push, move[MOVE_FORCE + before], p[ATT + after], width)
-        _add(place, time, p[VEL + i], width)
+        _add(push, -move.force[after], p[ATTITUDE + before], width)
+        _add(push, move.force[before], p[ATTITUDE + after], width)
+        _add(place, time, p[VELOCITY + i], width)
         _add(place, 0.5 * time, push, width)
         _add(speed, 1.0, push, width)
-        keep = move[MOVE_EXCESS_KEEP + i]
+        keep = move.stays_clipped[i]
         for c in range(width):
-            out[9 + i, c] *= move[MOVE_LOCAL_KEEP]
-            out[12 + i, c] = keep * (out[12 + i, c] + move[MOVE_SURGE_GAIN] * p[SURGE + i, c])
-            out[15 + i, c] *= keep * move[MOVE_SURGE_KEEP]
+            out[9 + i, c] *= local_keep
+            out[12 + i, c] = keep * (out[12 + i, c] + rate_gain * p[ANGULAR_ACC + i, c])
+            out[15 + i, c] *= keep * acc_keep
 
 
 @njit
 def _moved_back(move, p, width, out):
     """Rows _MOVED_BACK of Phi' p. p (N, width or more); out (len(_MOVED_BACK), width or more)."""
-    time = move[MOVE_TIME]
+    time, local_keep, acc_keep = move.time, move.local_field_keep, move.acc_keep
+    rate_gain, rate_mean = move.rate_gain, move.rate_mean
     for i in range(len(_MOVED_BACK)):
         for c in range(width):
             out[i, c] = p[_MOVED_BACK[i], c]
     push = np.empty((3, width))
     for i in range(3):
         for c in range(width):
-            push[i, c] = p[VEL + i, c] + 0.5 * time * p[POS + i, c]
-        _add(out[15 + i], time, p[POS + i], width)
+            push[i, c] = p[VELOCITY + i, c] + 0.5 * time * p[POSITION + i, c]
+        _add(out[15 + i], time, p[POSITION + i], width)
     for j in range(3):
         # (-[F]x)' p = [F]x p
         after, before = (j + 1) % 3, (j + 2) % 3
-        _add(out[j], move[MOVE_FORCE + after], push[before], width)
-        _add(out[j], -move[MOVE_FORCE + before], push[after], width)
+        _add(out[j], move.force[after], push[before], width)
+        _add(out[j], -move.force[before], push[after], width)
         turn = np.zeros(width)
         for i in range(3):
-            r = move[MOVE_ROTATION + 3 * i + j]
-            _add(out[3 + j], -r, p[ATT + i], width)
+            r = move.rotation[i, j]
+            _add(out[3 + j], -r, p[ATTITUDE + i], width)
             _add(out[21 + j], -r, push[i], width)
-            _add(turn, move[MOVE_EXCESS + 3 * i + j], p[ATT + i], width)
-        keep = move[MOVE_EXCESS_KEEP + j]
+            _add(turn, move.clipped_rotation[i, j], p[ATTITUDE + i], width)
+        keep = move.stays_clipped[j]
         for c in range(width):
-            out[18 + j, c] *= move[MOVE_LOCAL_KEEP]
-            out[27 + j, c] = keep * (move[MOVE_SURGE_KEEP] * p[SURGE + j, c]
-                                     + move[MOVE_SURGE_GAIN] * p[EXCESS + j, c]
-                                     + move[MOVE_SURGE_MEAN] * turn[c])
-            out[24 + j, c] = keep * (p[EXCESS + j, c] + turn[c])
+            out[18 + j, c] *= local_keep
+            out[27 + j, c] = keep * (acc_keep * p[ANGULAR_ACC + j, c]
+                                     + rate_gain * p[CLIPPED_RATE + j, c]
+                                     + rate_mean * turn[c])
+            out[24 + j, c] = keep * (p[CLIPPED_RATE + j, c] + turn[c])
     for j in range(9):
         for i in range(3):
-            _add(out[6 + j], move[MOVE_SCALE + 9 * i + j], p[ATT + i], width)
+            _add(out[6 + j], move.rotation_gyr[i, j], p[ATTITUDE + i], width)
 
 
 @njit
@@ -167,8 +192,8 @@ def _put(matrix, rows, corner, which, states):
 
 @njit
 def predict(cov, move):
-    """cov = Phi cov Phi' + noise, in place. cov (N, N) symmetric."""
-    states = int(move[MOVE_STATES])
+    """cov = Phi cov Phi' + noise, in place. cov (N, N) symmetric; move: a PREDICTION."""
+    states = move.states
     count = len(_MOVED)
     rows = np.empty((count, N))
     corner = np.empty((count, count))
@@ -176,13 +201,13 @@ def predict(cov, move):
     _moved(move, np.ascontiguousarray(rows.T), count, corner)
     _put(cov, rows, corner, _MOVED, states)
     for i in range(states):
-        cov[i, i] += move[MOVE_NOISE + i]
+        cov[i, i] += move.noise[i]
 
 
 @njit
 def predict_information(information, move):
     """information = Phi' information Phi, in place. information (N, N) symmetric."""
-    states = int(move[MOVE_STATES])
+    states = move.states
     count = len(_MOVED_BACK)
     rows = np.empty((count, N))
     corner = np.empty((count, count))
@@ -194,63 +219,71 @@ def predict_information(information, move):
 @njit
 def move_error(move, error):
     """Phi error, without noise. error (N,). Returns (N,)."""
-    states = int(move[MOVE_STATES])
     rows = np.empty((len(_MOVED), 1))
     _moved(move, error.copy().reshape(N, 1), 1, rows)
     out = error.copy()
     out[_MOVED] = rows[:, 0]
-    out[states:] = 0.0
+    out[move.states:] = 0.0
     return out
 
 
 @njit
 def move_adjoint(move, adjoint):
     """Phi' adjoint. adjoint (N,). Returns (N,)."""
-    states = int(move[MOVE_STATES])
     rows = np.empty((len(_MOVED_BACK), 1))
     _moved_back(move, adjoint.copy().reshape(N, 1), 1, rows)
     out = adjoint.copy()
     out[_MOVED_BACK] = rows[:, 0]
-    out[states:] = 0.0
+    out[move.states:] = 0.0
     return out
 
 
 @njit
-def update(cov, error, states, index, coefficient, residual, variance, tape):
-    """One scalar measurement of the error state, in place.
+def put_single(row, index, residual, variance):
+    """Make a ROW that measures one element of the error state."""
+    row.count = 1
+    row.index[0] = index
+    row.coefficient[0] = 1.0
+    row.residual = residual
+    row.variance = variance
 
-    residual = sum_a coefficient[a] error[index[a]] + noise of ``variance``.
+
+@njit
+def update(cov, error, states, row, tape):
+    """One scalar measurement of the error state, in place.
 
     Args:
         cov: (N, N). error: (N,) mean of the error so far.
         states: how many of them there are; the others are zero.
-        index, coefficient: (m,) the measurement's row, sparse.
-        tape: a block's tape, or an empty array.
+        row: a ROW.
+        tape: (1,) TAPE of the block, or empty.
+
+    Raises:
+        IndexError: the tape is full: MAX_UPDATES is less than the measurements of a block.
     """
-    count = len(index)
+    count = row.count
     spread = np.zeros(N)
     for a in range(count):
-        c = coefficient[a]
+        c = row.coefficient[a]
         if c != 0.0:
-            row = cov[index[a]]
+            line = cov[row.index[a]]
             for i in range(states):
-                spread[i] += c * row[i]
-    total = variance
-    innovation = residual
+                spread[i] += c * line[i]
+    total = row.variance
+    innovation = row.residual
     for a in range(count):
-        total += coefficient[a] * spread[index[a]]
-        innovation -= coefficient[a] * error[index[a]]
-    if len(tape) and tape[TAPE_OPS] < MAX_OPS:
-        op = tape[TAPE_OP + int(tape[TAPE_OPS]) * OP_SIZE:]
-        op[0] = count
-        for a in range(count):
-            op[OP_INDEX + a] = index[a]
-            op[OP_COEFFICIENT + a] = coefficient[a]
+        total += row.coefficient[a] * spread[row.index[a]]
+        innovation -= row.coefficient[a] * error[row.index[a]]
+    if len(tape):
+        t = tape[0]
+        if t.count == MAX_UPDATES:
+            raise IndexError("more updates in a block than its tape holds: raise MAX_UPDATES")
+        t.row[t.count] = row
         for i in range(N):
-            op[OP_GAIN + i] = spread[i] / total
-        op[OP_VARIANCE] = total
-        op[OP_RESIDUAL] = innovation
-        tape[TAPE_OPS] += 1
+            t.gain[t.count, i] = spread[i] / total
+        t.total[t.count] = total
+        t.innovation[t.count] = innovation
+        t.count += 1
     for i in range(states):
         gain = spread[i] / total
         error[i] += gain * innovation
@@ -260,15 +293,14 @@ def update(cov, error, states, index, coefficient, residual, variance, tape):
 
 
 @njit
-def unupdate(op, adjoint, information, states):
+def unupdate(tape, which, adjoint, information):
     """Carry the smoother's adjoint (N,) and information (N, N) back over one update.
 
     Modified Bryson-Frazier: with A = I - K h, ``l = A' l + h r / s`` and
-    ``L = A' L A + h h' / s``. states: as for :func:`update`.
+    ``L = A' L A + h h' / s``. tape: a TAPE; which: of its updates.
     """
-    count = int(op[0])
-    gain = op[OP_GAIN:OP_GAIN + N]
-    total = op[OP_VARIANCE]
+    states = tape.prediction.states
+    measured, gain, total = tape.row[which], tape.gain[which], tape.total[which]
     along = 0.0
     pulled = np.zeros(N)
     for i in range(states):
@@ -280,18 +312,16 @@ def unupdate(op, adjoint, information, states):
     both = 0.0
     for i in range(states):
         both += pulled[i] * gain[i]
-    for a in range(count):
-        row = int(op[OP_INDEX + a])
-        c = op[OP_COEFFICIENT + a]
+    for a in range(measured.count):
+        row = measured.index[a]
+        c = measured.coefficient[a]
         if c == 0.0:
             continue
-        adjoint[row] += c * (op[OP_RESIDUAL] / total - along)
+        adjoint[row] += c * (tape.innovation[which] / total - along)
         for j in range(states):
             information[row, j] -= c * pulled[j]
             information[j, row] -= c * pulled[j]
-    for a in range(count):
-        row = int(op[OP_INDEX + a])
-        for b in range(count):
-            column = int(op[OP_INDEX + b])
-            information[row, column] += (op[OP_COEFFICIENT + a] * op[OP_COEFFICIENT + b]
-                                         * (both + 1.0 / total))
+    for a in range(measured.count):
+        for b in range(measured.count):
+            information[measured.index[a], measured.index[b]] += (
+                measured.coefficient[a] * measured.coefficient[b] * (both + 1.0 / total))

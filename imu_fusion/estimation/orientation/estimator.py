@@ -7,86 +7,85 @@ time or a whole log at once, the same kernel runs in the same order.
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.orientation import fusion
-from imu_fusion.estimation.orientation import gyro_mag
-from imu_fusion.estimation.orientation import state as st
-from imu_fusion.estimation.orientation.alignment import align, usable_mags
-from imu_fusion.estimation.orientation.detect import limits_of
-from imu_fusion.estimation.orientation.fixed_lag import FixedLag
-from imu_fusion.estimation.orientation.params import OrientationParams
+from imu_fusion.estimation.orientation import kernel
+from imu_fusion.estimation.orientation.alignment import Alignment, align, usable_mags
+from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.fixed_interval import smooth
-from imu_fusion.estimation.orientation.state import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.fixed_lag import FixedLag
+from imu_fusion.estimation.orientation.gyro_limit import limits_of
+from imu_fusion.estimation.orientation.imu_rejection import are_imu_samples, is_imu_sample
+from imu_fusion.estimation.orientation.mag_rejection import is_mag_sample
+from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
+from imu_fusion.estimation.orientation.rows import FLAG_GAP, ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.state import COUNTS, new_state
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_to_rpy
+from imu_fusion.samples.logs import ImuLog, MagLog
 
-# Rotation from ENU to the world frame that is published, xyzw.
-_WORLD_FRAMES = {
-    "enu": (0.0, 0.0, 0.0, 1.0),
-    "nwu": (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5)),
-    "ned": (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
-}
 _CHUNK = 256
-_COUNTERS = (st.IMU_USED, st.IMU_REJECTED, st.MAG_USED, st.MAG_REJECTED, st.MAG_LATE,
-             st.MAG_DISTURBED, st.GAPS, st.SATURATED, st.MAG_SATURATED,
-             st.RATES_HELD)
-
-
-def _axes(value, default):
-    """A parameter of one or three elements as (3,)."""
-    return np.full(3, default) if value is None else np.broadcast_to(value, 3).astype(float)
+_NO_TAPES = np.zeros(0, TAPE)
 
 
 class OrientationEstimator:
-    """Causal orientation from gyroscope, accelerometer and magnetometer samples.
+    """Orientation from gyroscope, accelerometer and magnetometer samples.
 
     Rows of ORIENTATION_DTYPE come out, one per accepted Imu sample, in order. None
-    come while the first ``alignment_duration`` seconds are collected; then all of
+    come while the first ``alignment.duration`` seconds are collected; then all of
     them at once.
 
     A sample that is not finite is counted and dropped, and so is an Imu sample
     that is not newer than the last. A magnetometer sample may come late by up to
-    ``max_mag_lag``. After a gap the estimate goes on with a larger covariance, after one above
-    ``restart_gap`` it starts anew.
+    ``mag.max_latency``. After a gap the estimate goes on with a larger covariance, after one above
+    ``gap.restart`` it starts anew.
     """
 
-    def __init__(self, params=OrientationParams()):
+    def __init__(self, params: OrientationParams = OrientationParams()) -> None:
         self.params = params
-        self._kernel = {"fusion": fusion, "gyro_mag": gyro_mag}[params.method]
-        self._par = self._pack(params)
+        self._par = kernel_parameters(params)
         self._sample = np.empty(6)
         self._mag = np.empty(3)
         self._new_chunk()
         self.reset()
 
-    def set_params(self, params):
+    def set_params(self, params: OrientationParams) -> None:
         """Go on with other parameters from the next sample on.
 
         Raises:
             ParameterError: another method or mode, which have another state.
         """
-        if (params.method, params.mode) != (self.params.method, self.params.mode):
-            raise ParameterError("parameters 'method' and 'mode' cannot change while running: "
-                                 "start another estimator")
-        self.params, self._par = params, self._pack(params)
+        if self._kind(params) != self._kind(self.params):
+            raise ParameterError(
+                "parameters 'method', 'gyro_mag.as_printed' and 'mode' cannot change while "
+                "running: start another estimator")
+        self.params, self._par = params, kernel_parameters(params)
 
-    def reset(self):
+    @staticmethod
+    def _kind(params):
+        return params.method, params.is_as_printed, params.mode
+
+    def reset(self) -> None:
         """Forget all samples: the next ones start a new alignment."""
-        self._counted = np.zeros(self._kernel.K_SIZE, dtype=np.int64)
+        self._counted = np.zeros(1, COUNTS)
         self._yaw = 0.0
         self._forget()
 
     def _forget(self):
-        self._x = np.zeros(self._kernel.X_SIZE)
-        self._k = np.zeros(self._kernel.K_SIZE, dtype=np.int64)
+        self._adopt(new_state())
         self._waiting = []
         self._waiting_imus = 0
-        self._alignment = None
-        self._lag = FixedLag(self.params.lag) if self.params.lag else None
+        self._alignment: Alignment | None = None
+        self._lag = None if self.params.lag is None else FixedLag(self.params.lag)
 
-    def add_imu(self, stamp, gyr, acc):
+    def _adopt(self, state):
+        self._state = state
+        self._newest = state["stamp"]    # a view: (1,)
+
+    def add_imu(self, stamp: int, gyr: ArrayLike, acc: ArrayLike) -> np.ndarray:
         """Take one Imu sample.
 
         Args:
@@ -99,29 +98,30 @@ class OrientationEstimator:
         self._sample[3:] = acc
         last = self._last_imu()
         if (last is not None and stamp - last > self._restart_gap
-                and st.is_imu_sample(self._sample)):
+                and is_imu_sample(self._sample)):
             return np.concatenate([self._restart(), self.add_imu(stamp, gyr, acc)])
         if self._alignment is None:
             return self._wait_imu(stamp)
         return self._step(stamp)
 
-    def add_mag(self, stamp, mag):
+    def add_mag(self, stamp: int, mag: ArrayLike) -> np.ndarray:
         """Take one magnetometer sample: int ns, (3,) tesla. Returns rows like add_imu."""
         self._mag[:] = mag
         if self._alignment is None:
-            if st.is_mag_sample(self._mag):
+            if is_mag_sample(self._mag):
                 self._waiting.append((stamp, self._mag.copy()))
             else:
-                self._k[st.MAG_REJECTED] += 1
+                self._state["counts"]["mag_rejected"] += 1
         else:
-            self._kernel.push_mag(self._x, self._k, self._par, stamp, self._mag)
+            _, push_mag = kernel.live_calls()
+            push_mag(self._state, self._par, stamp, self._mag)
             # While no Imu comes, none is kept: after that gap all starts anew.
             if (self._lag is not None
-                    and stamp - int(self._k[st.LAST_STAMP]) <= self._restart_gap):
-                self._lag.add((), None, np.array([stamp]), self._mag.copy()[None])
+                    and stamp - int(self._newest[0]) <= self._restart_gap):
+                self._lag.add_mag(np.array([stamp]), self._mag.copy()[None])
         return self._chunk[:0]
 
-    def finish(self):
+    def finish(self) -> np.ndarray:
         """The end of the stream: rows that still wait for the alignment."""
         rows = self._chunk[:0]
         if self._alignment is None and self._waiting_imus:
@@ -130,12 +130,12 @@ class OrientationEstimator:
             self._lag.finish(self._par)
         return rows
 
-    def take_corrected(self):
+    def take_corrected(self) -> np.ndarray:
         """Rows corrected by looking ahead (parameter ``lag``) since the last call; the last
         ones come with :meth:`finish`."""
         return self._chunk[:0] if self._lag is None else self._lag.take()
 
-    def run(self, imu, mag=None):
+    def run(self, imu: ImuLog, mag: MagLog | None = None) -> np.ndarray:
         """Whole logs: the same as add_imu and add_mag in merge order, in one compiled loop.
 
         Merge order is by stamp, the magnetometer first where stamps are equal.
@@ -186,7 +186,7 @@ class OrientationEstimator:
 
     def _restarts(self, imu):
         """Indices of the samples before which the estimator starts anew."""
-        good = np.flatnonzero(st.are_imu_samples(np.hstack([imu.gyr, imu.acc])))
+        good = np.flatnonzero(are_imu_samples(np.hstack([imu.gyr, imu.acc])))
         newest = np.maximum.accumulate(imu.stamp[good])
         last = self._last_imu()
         before = np.append(newest[:1] if last is None else last, newest[:-1])
@@ -195,12 +195,12 @@ class OrientationEstimator:
 
     @property
     def _restart_gap(self):
-        return int(self.params.restart_gap * 1e9)
+        return int(self.params.gap.restart * 1e9)
 
     def _last_imu(self):
         """Stamp of the newest Imu sample taken, or None."""
         if self._alignment is not None:
-            return int(self._k[st.LAST_STAMP])
+            return int(self._newest[0])
         return next((s for s, v in reversed(self._waiting) if len(v) == 6), None)
 
     def _restart(self):
@@ -208,35 +208,33 @@ class OrientationEstimator:
         anew, at the yaw of before if nothing tells another."""
         rows = self.finish()
         if self._alignment is not None:
-            self._yaw = quat_to_rpy(self._x[st.Q:st.Q + 4])[2]
+            self._yaw = quat_to_rpy(self._state["quat_world_imu"][0])[2]
         corrected = None if self._lag is None else self._lag.take()
-        for counter in _COUNTERS:
-            self._counted[counter] += self._k[counter]
-        self._counted[st.GAPS] += 1
+        self._counted = self._counts()
+        self._counted["gaps"] += 1
         self._forget()
-        self._k[st.MAG_FLAGS] |= st.FLAG_GAP
+        self._state["waiting_flags"] |= FLAG_GAP
         if self._lag is not None:
             self._lag.keep(corrected)
         return rows
 
-    def get_state(self):
+    def get_state(self) -> dict[str, Any]:
         """A snapshot for :meth:`set_state`: going on from it changes nothing."""
-        return dict(x=self._x.copy(), k=self._k.copy(), waiting=list(self._waiting),
-                    counted=self._counted.copy(), yaw=self._yaw,
+        return dict(kind=self._kind(self.params), state=self._state.copy(),
+                    waiting=list(self._waiting), counted=self._counted.copy(), yaw=self._yaw,
                     alignment=self._alignment,
                     lag=None if self._lag is None else self._lag.copy())
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a snapshot of an estimator with the same parameters.
 
         Raises:
-            SampleError: the snapshot is that of another method.
+            SampleError: the snapshot is that of another method or mode.
         """
-        if state["x"].shape != self._x.shape or state["k"].shape != self._k.shape:
-            raise SampleError("the orientation snapshot was taken with another method; "
-                              f"this estimator runs '{self.params.method}'")
-        self._x = state["x"].copy()
-        self._k = state["k"].copy()
+        if state["kind"] != self._kind(self.params):
+            raise SampleError("the orientation snapshot was taken with another method or mode; "
+                              f"this estimator runs '{self.params.method}', '{self.params.mode}'")
+        self._adopt(state["state"].copy())
         self._waiting = list(state["waiting"])
         self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
         self._alignment = state["alignment"]
@@ -244,63 +242,64 @@ class OrientationEstimator:
         self._lag = None if state["lag"] is None else state["lag"].copy()
 
     @property
-    def mag_saturated(self):
+    def mag_saturated(self) -> int:
         """How many magnetometer samples were refused with an axis at its limit."""
-        return int(self._k[st.MAG_SATURATED] + self._counted[st.MAG_SATURATED])
+        return int(self._counts()["mag_saturated"][0])
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
-        k, x, a = self._k + self._counted, self._x, self._alignment
+        s, par, a = self._state[0], self._par[0], self._alignment
         counts = dict(
-            method=self.params.method, aligned=a is not None, imu_used=int(k[st.IMU_USED]),
-            imu_rejected=int(k[st.IMU_REJECTED]), mag_used=int(k[st.MAG_USED]),
-            mag_rejected=int(k[st.MAG_REJECTED]), mag_late=int(k[st.MAG_LATE]),
-            mag_disturbed=int(k[st.MAG_DISTURBED]),
-            mag_saturated=int(k[st.MAG_SATURATED]), gaps=int(k[st.GAPS]),
-            saturated=int(k[st.SATURATED]), rates_held=int(k[st.RATES_HELD]))
+            method=self.params.method, aligned=a is not None,
+            **{name: int(self._counts()[name][0]) for name in COUNTS.names})
         if a is None:
             return counts
-        bias = x[st.GYR_BIAS:st.GYR_BIAS + 3]
         return counts | dict(
-            started_at_rest=a.at_rest, has_heading=bool(k[st.HEADING_KNOWN]),
+            started_at_rest=a.at_rest, has_heading=bool(s["heading_known"]),
             **{f"initial_quat_{c}": float(v) for c, v in zip("xyzw", a.quat_world_imu)},
             initial_tilt_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[0, 0])),
             initial_heading_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[2, 2])),
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
-            **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", bias)},
-            gyro_delay=self._par[st.P_GYR_DELAY],
-            mag_delay=self._par[st.P_GYR_DELAY] + float(x[st.LAG]))
+            **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", s["gyro_bias"])},
+            gyro_delay=float(par["gyro_delay"]),
+            mag_delay=float(par["gyro_delay"] + s["mag_lag"]))
+
+    def _counts(self):
+        """Counts of the present stretch and of those before it, (1,) COUNTS."""
+        total = self._counted.copy()
+        for name in COUNTS.names:
+            total[name] += self._state["counts"][name]
+        return total
 
     def _step(self, stamp):
         if self._next == _CHUNK:
             self._new_chunk()
         if self._lag is not None:
             if stamp >= self._lag.border:
-                self._lag.cross(stamp, self._x, self._k, self._par)
-            self._lag.add(np.array([stamp]), self._sample.copy()[None], (), None)
-        i = self._next
-        if not self._kernel.step_imu(self._x, self._k, self._par, stamp, self._sample,
-                                     self._floats[i], self._ints[i]):
+                self._lag.cross(stamp, self._state, self._par)
+            self._lag.add_imu(np.array([stamp]), self._sample.copy()[None])
+        row = self._chunk[self._next:self._next + 1]
+        step_imu, _ = kernel.live_calls()
+        if not step_imu(self._state, self._par, stamp, self._sample, row):
             return self._chunk[:0]
-        self._next = i + 1
-        return self._chunk[i:i + 1]
+        self._next += 1
+        return row
 
     def _new_chunk(self):
         # Rows are handed out as slices of a chunk: one allocation for many samples.
         self._chunk = np.zeros(_CHUNK, ORIENTATION_DTYPE)
-        self._floats, self._ints = _views(self._chunk)
         self._next = 0
 
     def _wait_imu(self, stamp):
         last = self._last_imu()
-        if not st.is_imu_sample(self._sample) or (last is not None and stamp <= last):
-            self._k[st.IMU_REJECTED] += 1
+        if not is_imu_sample(self._sample) or (last is not None and stamp <= last):
+            self._state["counts"]["imu_rejected"] += 1
             return self._chunk[:0]
         self._waiting.append((stamp, self._sample.copy()))
         self._waiting_imus += 1
         first = next(s for s, v in self._waiting if len(v) == 6)
-        if stamp - first < self.params.alignment_duration * 1e9:
+        if stamp - first < self.params.alignment.duration * 1e9:
             return self._chunk[:0]
         return self._start()
 
@@ -309,19 +308,19 @@ class OrientationEstimator:
             raise EstimationError("mode 'smoothed' needs the whole recording in one run(); "
                                   "reset() first, or use mode 'causal'")
         samples = np.hstack([imu.gyr, imu.acc])
-        good = st.are_imu_samples(samples)
+        good = are_imu_samples(samples)
         if not good.any():
             return self._chunk[:0]
         origin = imu.stamp[np.argmax(good)]
-        end = origin + int(self.params.alignment_duration * 1e9)
+        end = origin + int(self.params.alignment.duration * 1e9)
         first = good & (imu.stamp <= end)
         first_mag = mag_stamps <= end
-        first_mag[first_mag] = [st.is_mag_sample(mag) for mag in mags[first_mag]]
+        first_mag[first_mag] = [is_mag_sample(mag) for mag in mags[first_mag]]
         self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
         rows = np.zeros(len(imu), ORIENTATION_DTYPE)
         after = mag_stamps >= origin
-        written = smooth(self._x, self._k, self._par, imu.stamp, samples, mag_stamps[after],
-                         mags[after], *_views(rows))
+        written = smooth(self._state, self._par, imu.stamp, samples, mag_stamps[after],
+                         mags[after], rows)
         return rows[:written]
 
     def _start(self):
@@ -338,25 +337,21 @@ class OrientationEstimator:
         return self._run_kernel(stamps, samples, mag_stamps[after], mag[after])
 
     def _align(self, stamps, samples, mag_stamps, mag):
-        p, par = self.params, self._par
-        usable = usable_mags(mag, par[st.P_MAG_RANGE:st.P_MAG_RANGE + 3])
+        par, sensor = self._par, self.params.sensor
+        usable = usable_mags(mag, par)
         usable &= mag_stamps >= stamps[0]    # how the sensor turned before, nobody knows
         mag_stamps, mag = mag_stamps[usable], mag[usable]
-        calibrated = ((mag - par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3])
-                      @ par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9].reshape(3, 3).T)
-        self._alignment = align(
-            stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
-            declination=par[st.P_DECLINATION], yaw_offset=math.radians(p.yaw_offset_deg),
-            gyr_density=p.gyro_noise_density, gyr_bias_sd=p.gyro_bias_sd,
-            acc_bias_sd=p.acc_bias_sd, mag_sd=p.mag_noise_sd,
-            gyr_limits=limits_of(samples[:, :3], par))
+        calibrated = (mag - sensor.mag_offset) @ np.reshape(sensor.mag_matrix, (3, 3)).T
+        self._alignment = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
+                                self.params, limits_of(samples[:, :3], par))
         if not self._alignment.has_heading and self._yaw:
             turn = self._yaw - quat_to_rpy(self._alignment.quat_world_imu)[2]
             self._alignment = replace(self._alignment, quat_world_imu=np.array(
                 quat_multiply(quat_exp((0.0, 0.0, turn)), self._alignment.quat_world_imu)))
-        self._x[st.LAG] = 0.0 if p.mag_delay is None else p.mag_delay - self._par[st.P_GYR_DELAY]
-        self._kernel.initialise(self._x, self._k, par, self._alignment)
-        self._k[st.ALIGN_UNTIL] = stamps[-1]
+        if sensor.mag_delay is not None:
+            self._state["mag_lag"] = sensor.mag_delay - par["gyro_delay"]
+        kernel.initialise(self._state, par, self._alignment)
+        self._state["align_until"] = stamps[-1]
 
     def _run_kernel(self, stamps, samples, mag_stamps, mags):
         if self._lag is None:
@@ -365,50 +360,24 @@ class OrientationEstimator:
         i = j = 0
         while i < len(stamps) or j < len(mag_stamps):
             if i < len(stamps) and stamps[i] >= self._lag.border:
-                self._lag.cross(int(stamps[i]), self._x, self._k, self._par)
+                self._lag.cross(int(stamps[i]), self._state, self._par)
             beyond = np.flatnonzero(stamps[i:] >= self._lag.border)
             end = i + int(beyond[0]) if len(beyond) else len(stamps)
             # A magnetometer sample comes before the Imu sample of its own stamp.
             end_mag = (np.searchsorted(mag_stamps, stamps[end], side="right")
                        if end < len(stamps) else len(mag_stamps))
             end_mag = max(end_mag, j)
-            window = (stamps[i:end], samples[i:end], mag_stamps[j:end_mag], mags[j:end_mag])
-            parts.append(self._run_window(*window))
-            self._lag.add(*window)
+            imus, mag_part = (stamps[i:end], samples[i:end]), (mag_stamps[j:end_mag],
+                                                               mags[j:end_mag])
+            parts.append(self._run_window(*imus, *mag_part))
+            self._lag.add_imu(*imus)
+            self._lag.add_mag(*mag_part)
             i, j = end, end_mag
         return np.concatenate([self._chunk[:0], *parts])
 
     def _run_window(self, stamps, samples, mag_stamps, mags):
         rows = np.zeros(len(stamps), ORIENTATION_DTYPE)
-        written = self._kernel.run_loop(self._x, self._k, self._par, stamps, samples,
-                                        mag_stamps, mags, *_views(rows))
-        return rows[:written]
-
-    def _pack(self, p):
-        par = np.zeros(self._kernel.P_SIZE)
-        par[st.P_GYR_DELAY] = p.gyro_delay or 0.0
-        par[st.P_DELAY_SD] = p.gyro_delay_sd if p.gyro_delay is None else 0.0
-        par[st.P_DECLINATION] = math.radians(p.declination_deg or 0.0)
-        par[st.P_MAX_LAG] = p.max_mag_lag
-        par[st.P_MAX_GAP] = p.max_gap
-        par[st.P_GYR_DENSITY] = p.gyro_noise_density
-        par[st.P_ACC_DENSITY] = p.acc_noise_density
-        par[st.P_ACC_BIAS_SD] = p.acc_bias_sd
-        par[st.P_MAG_SD] = p.mag_noise_sd
-        par[st.P_RELIABILITY] = p.mag_reliability
-        par[st.P_GAP_RATE_SD] = p.gap_rate_sd
-        par[st.P_BIAS_WALK] = p.gyro_bias_walk
-        par[st.P_AXES_SD] = p.axes_sd
-        par[st.P_RANGE:st.P_RANGE + 3] = _axes(p.gyro_range, np.nan)
-        par[st.P_MAG_RANGE:st.P_MAG_RANGE + 3] = _axes(p.mag_range, np.nan)
-        par[st.P_FRAME:st.P_FRAME + 4] = _WORLD_FRAMES[p.world_frame]
-        par[st.P_IRON_OFFSET:st.P_IRON_OFFSET + 3] = p.mag_offset
-        par[st.P_IRON_MATRIX:st.P_IRON_MATRIX + 9] = p.mag_matrix
-        self._kernel.pack(par, p)
-        return par
-
-
-def _views(rows):
-    """Float and integer (n, ROW_WORDS) views of contiguous rows."""
-    return (rows.view(np.float64).reshape(-1, st.ROW_WORDS),
-            rows.view(np.int64).reshape(-1, st.ROW_WORDS))
+        cursor = np.zeros(1, kernel.CURSOR)
+        kernel.forward(self._state, self._par, stamps, samples, mag_stamps, mags, cursor, rows,
+                       _NO_TAPES)
+        return rows[:cursor["row"][0]]

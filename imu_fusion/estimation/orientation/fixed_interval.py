@@ -12,128 +12,112 @@ import numpy as np
 from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation import error_state as es
-from imu_fusion.estimation.orientation import fusion
-from imu_fusion.estimation.orientation import state as st
+from imu_fusion.estimation.orientation.kernel import CURSOR, forward
+from imu_fusion.estimation.orientation.rows import (
+    clipped_axes, raise_to_limits, write_cov_attitude)
 from imu_fusion.geometry.rotation import (
     quat_conjugate, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix)
 
-N = es.N
-_SEGMENT = 128      # blocks between snapshots
-# Of the error state, what rows report: attitude, bias, accelerometer bias, excess.
-_REPORTED = np.array([0, 1, 2, 3, 4, 5, 30, 31, 32, 43, 44, 45])
+# Blocks between snapshots. A snapshot is about as large as a tape: the memory of n blocks,
+# n / 128 snapshots and 128 tapes, is smallest near sqrt(n), 2.5 s for five minutes of 20 ms blocks.
+_SEGMENT = 128
+# Of the error state, what rows report: attitude, bias, accelerometer bias, clipped rate.
+_REPORTED = np.array([*range(es.ATTITUDE, es.GYRO_SCALE), *range(es.ACC_BIAS, es.MAG_LAG),
+                      *range(es.CLIPPED_RATE, es.ANGULAR_ACC)])
+_BIAS, _CLIPPED = 3, 9    # in _REPORTED
 
 
-def smooth(x, k, par, stamps, samples, mag_stamps, mags, rows, rows_int):
+def smooth(state: np.ndarray, par: np.ndarray, stamps: np.ndarray, samples: np.ndarray,
+           mag_stamps: np.ndarray, mags: np.ndarray, rows: np.ndarray) -> int:
     """Smoothed rows of a whole recording.
 
     Args:
-        x, k, par: initialised state of the fusion kernel; ends as the causal filter's.
-        stamps (n,), samples (n, 6), mag_stamps (m,), mags (m, 3): as for run_loop.
-        rows, rows_int: views of the output.
+        state, par: (1,), initialised; ends as the causal filter's.
+        stamps (n,), samples (n, 6), mag_stamps (m,), mags (m, 3): as for kernel.forward.
+        rows: (n,) ORIENTATION_DTYPE, zeros.
 
     Returns:
         Number of rows written.
     """
-    tapes = np.zeros((_SEGMENT, es.TAPE_SIZE))
-    block_of_row = np.zeros(len(stamps), dtype=np.int64)
-    block_stamps = np.zeros(_SEGMENT, dtype=np.int64)
+    tapes = np.zeros(_SEGMENT, es.TAPE)
+    cursor = np.zeros(1, CURSOR)
     snapshots = []
-    i = j = written = 0
-    while i < len(stamps):
-        snapshots.append((x.copy(), k.copy(), i, j, written))
-        i, j, written, _ = _forward(x, k, par, stamps, samples, mag_stamps, mags, i, j, written,
-                                    rows, rows_int, tapes, block_stamps, block_of_row)
-    while j < len(mag_stamps):
-        fusion.push_mag(x, k, par, mag_stamps[j], mags[j])
-        j += 1
-    adjoint = np.zeros(N)
-    information = np.zeros((N, N))
-    end = written
-    for x0, k0, i, j, first in reversed(snapshots):
-        cov0, stamp0 = x0[fusion.COV:fusion.COV + N * N].copy(), k0[fusion.BLOCK_START]
-        _, _, _, blocks = _forward(x0, k0, par, stamps, samples, mag_stamps, mags, i, j, first,
-                                   rows, rows_int, tapes, block_stamps, block_of_row)
-        _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, end,
-                  adjoint, information, par, x[fusion.HEADING_VAR],
-                  x[fusion.LIMIT:fusion.LIMIT + 3], rows, rows_int)
+    while cursor["imu"][0] < len(stamps):
+        snapshots.append((state.copy(), cursor.copy()))
+        forward(state, par, stamps, samples, mag_stamps, mags, cursor, rows, tapes)
+    written = end = int(cursor["row"][0])
+    adjoint = np.zeros(es.N)
+    information = np.zeros((es.N, es.N))
+    for before, cursor in reversed(snapshots):
+        first = int(cursor["row"][0])
+        blocks = forward(before.copy(), par, stamps, samples, mag_stamps, mags, cursor, rows,
+                         tapes)
+        _backward(tapes[:blocks], before, state, par, rows[first:end], first, adjoint, information)
         end = first
     return written
 
 
 @njit
-def _forward(x, k, par, stamps, samples, mag_stamps, mags, i, j, written, rows, rows_int,
-             tapes, block_stamps, block_of_row):
-    """The filter until all tapes are full. Returns i, j, written, blocks on tape."""
-    blocks = 0
-    while i < len(stamps) and blocks < len(tapes):
-        while j < len(mag_stamps) and mag_stamps[j] <= stamps[i]:
-            fusion.push_mag(x, k, par, mag_stamps[j], mags[j])
-            j += 1
-        result = fusion.advance(x, k, par, stamps[i], samples[i], rows[written],
-                                rows_int[written], tapes[blocks])
-        if result:
-            block_of_row[written] = blocks
-            written += 1
-        if result == 2:
-            block_stamps[blocks] = stamps[i]
-            blocks += 1
-        i += 1
-    return i, j, written, blocks
+def _backward(tapes, before, final, par, rows, first, adjoint, information):
+    """Correct the rows of one segment; carry adjoint and information before it.
+
+    Args:
+        tapes: (k,) of its blocks. before: (1,) state at its start; final: at the recording's end.
+        rows: its rows; first: the index of the first of them in the recording.
+        adjoint, information: (N,), (N, N) of what comes later; changed.
+    """
+    p, s0, limits = par[0], before[0], final[0].gyro_limit.limit
+    blocks = len(tapes)
+    row = len(rows) - 1
+    ended = tapes[blocks - 1].row_end - first if blocks else 0
+    while row >= ended:
+        # Behind the last block of the recording: already the best there is.
+        raise_to_limits(rows[row].gyr, clipped_axes(rows[row].flags), limits)
+        row -= 1
+    last = tapes[blocks - 1].cov[:] if blocks else s0.cov[:]
+    after, cov_after = last @ adjoint, _smoothed_cov(last, information)
+    for b in range(blocks - 1, -1, -1):
+        tape = tapes[b]
+        pushed = _unwind(tape, adjoint, information)
+        before_cov = tapes[b - 1].cov[:] if b else s0.cov[:]
+        before_stamp = tapes[b - 1].stamp if b else s0.block_start
+        begun = tapes[b - 1].row_end - first if b else 0
+        error = before_cov @ adjoint
+        cov_before = _smoothed_cov(before_cov, information)
+        predicted = es.move_error(tape.prediction, error) + pushed
+        span = max(tape.stamp - before_stamp, 1)
+        while row >= begun:
+            if rows[row].stamp == tape.stamp:
+                _correct_row(rows[row], p, after, cov_after, final[0].heading_var, limits)
+            else:
+                part = (rows[row].stamp - before_stamp) / span
+                _correct_row(rows[row], p, (1.0 - part) * error + part * predicted,
+                             (1.0 - part) * cov_before + part * cov_after,
+                             final[0].heading_var, limits)
+            row -= 1
+        after, cov_after = error, cov_before
 
 
 @njit
-def _backward(tapes, blocks, cov0, stamp0, block_stamps, block_of_row, first, end, adjoint,
-              information, par, heading_var, limits, rows, rows_int):
-    """Correct the rows first..end of one segment; carry adjoint and information before it."""
-    row = end - 1
-    while row >= first and block_of_row[row] == blocks:
-        # Behind the last block of the recording: already the best there is.
-        st.beyond_limits(rows[row, st.ROW_GYR:st.ROW_GYR + 3], _clipped(rows_int[row]), limits)
-        row -= 1
-    last = cov0 if blocks == 0 else tapes[blocks - 1, es.TAPE_COV:es.TAPE_COV + N * N]
-    after = last.reshape(N, N) @ adjoint
-    cov_after = _smoothed_cov(last.reshape(N, N), information)
-    for b in range(blocks - 1, -1, -1):
-        tape = tapes[b]
-        states = int(tape[es.TAPE_MOVE + es.MOVE_STATES])
-        move = tape[es.TAPE_MOVE:es.TAPE_MOVE + es.MOVE_SIZE]
-        for op in range(int(tape[es.TAPE_OPS]) - 1, -1, -1):
-            start = es.TAPE_OP + op * es.OP_SIZE
-            es.unupdate(tape[start:start + es.OP_SIZE], adjoint, information, states)
-        pushed = adjoint * move[es.MOVE_NOISE:es.MOVE_NOISE + N]
-        if tape[es.TAPE_TURNED]:
-            adjoint[:] = 0.0
-            information[:] = 0.0
-        else:
-            adjoint[:] = es.move_adjoint(move, adjoint)
-            es.predict_information(information, move)
-        before_cov = cov0.reshape(N, N)
-        before_stamp = stamp0
-        if b > 0:
-            before_cov = tapes[b - 1, es.TAPE_COV:es.TAPE_COV + N * N].reshape(N, N)
-            before_stamp = block_stamps[b - 1]
-        before = before_cov @ adjoint
-        cov_before = _smoothed_cov(before_cov, information)
-        predicted = es.move_error(move, before) + pushed
-        span = max(block_stamps[b] - before_stamp, 1)
-        while row >= first and block_of_row[row] == b:
-            if rows_int[row, 0] == block_stamps[b]:
-                error, cov_row = after, cov_after
-            else:
-                part = (rows_int[row, 0] - before_stamp) / span
-                error = (1.0 - part) * before + part * predicted
-                cov_row = (1.0 - part) * cov_before + part * cov_after
-            _correct_row(rows[row], par, error, cov_row, heading_var, _clipped(rows_int[row]),
-                         limits)
-            row -= 1
-        after, cov_after = before, cov_before
+def _unwind(tape, adjoint, information):
+    """Carry adjoint and information before a block. Returns (N,) the adjoint times its noise."""
+    for which in range(tape.count - 1, -1, -1):
+        es.unupdate(tape, which, adjoint, information)
+    pushed = adjoint * tape.prediction.noise
+    if tape.turned:
+        adjoint[:] = 0.0
+        information[:] = 0.0
+    else:
+        adjoint[:] = es.move_adjoint(tape.prediction, adjoint)
+        es.predict_information(information, tape.prediction)
+    return pushed
 
 
 @njit
 def _smoothed_cov(cov, information):
     """P - P L P, of the reported states only. Returns (12, 12)."""
     n = len(_REPORTED)
-    part = np.empty((n, N))
+    part = np.empty((n, es.N))
     for i in range(n):
         part[i] = cov[_REPORTED[i]]
     seen = part @ information
@@ -146,35 +130,30 @@ def _smoothed_cov(cov, information):
 
 
 @njit
-def _clipped(row_int):
-    """Bits of the gyroscope axes at their limit."""
-    return (row_int[st.FLAGS_WORD] >> st.SATURATED_AXES_SHIFT) & 7
-
-
-@njit
-def _correct_row(row, par, error, cov, heading_var, clipped, limits):
+def _correct_row(row, p, error, cov, heading_var, limits):
     """Apply the error (N,) and its covariance (12, 12) to one output row."""
-    frame = par[st.P_FRAME:st.P_FRAME + 4]
+    frame = p.frame_from_enu
     back = quat_conjugate(frame)
-    turn = quat_exp(error[es.ATT:es.ATT + 3])
-    quat = quat_normalize(quat_multiply(
-        turn, quat_multiply(back, row[st.ROW_QUAT:st.ROW_QUAT + 4])))
-    row[st.ROW_QUAT:st.ROW_QUAT + 4] = quat_normalize(quat_multiply(frame, quat))
+    turn = quat_exp(error, 1.0)
+    quat = quat_normalize(quat_multiply(turn, quat_multiply(back, row.quat_world_imu)))
+    row.quat_world_imu[:] = quat_normalize(quat_multiply(frame, quat))
     turn_out = quat_multiply(frame, quat_multiply(turn, back))
-    row[st.ROW_MAG:st.ROW_MAG + 3] = quat_rotate(turn_out, row[st.ROW_MAG:st.ROW_MAG + 3])
-    rate = row[st.ROW_GYR:st.ROW_GYR + 3].copy()
+    row.mag_world[:] = quat_rotate(turn_out, row.mag_world)
+    clipped = clipped_axes(row.flags)
+    gyr = row.gyr
+    rate = (gyr[0], gyr[1], gyr[2])
     for i in range(3):
-        row[st.ROW_BIAS + i] += error[es.BIAS + i]
         at_limit = (clipped >> i) & 1
-        row[st.ROW_GYR + i] += error[es.EXCESS + i] * at_limit - error[es.BIAS + i]
+        row.gyr_bias[i] += error[es.GYRO_BIAS + i]
+        gyr[i] += error[es.CLIPPED_RATE + i] * at_limit - error[es.GYRO_BIAS + i]
         for j in range(3):
-            row[st.ROW_GYR + i] += error[es.SCALE + 3 * i + j] * rate[j]
-        row[st.ROW_ACC + i] -= error[es.ACC_BIAS + i]
-        row[st.ROW_BIAS_SD + i] = math.sqrt(max(cov[3 + i, 3 + i], 0.0))
+            gyr[i] += error[es.GYRO_SCALE + 3 * i + j] * rate[j]
+        row.acc[i] -= error[es.ACC_BIAS + i]
+        row.gyr_bias_sd[i] = math.sqrt(max(cov[_BIAS + i, _BIAS + i], 0.0))
         if at_limit:
-            row[st.ROW_COV_GYR + 4 * i] = max(cov[9 + i, 9 + i], 0.0) + cov[3 + i, 3 + i]
-    st.beyond_limits(row[st.ROW_GYR:st.ROW_GYR + 3], clipped, limits)
+            row.cov_gyr[i, i] = (max(cov[_CLIPPED + i, _CLIPPED + i], 0.0)
+                                 + cov[_BIAS + i, _BIAS + i])
+    raise_to_limits(gyr, clipped, limits)
     cov_world = cov[:3, :3].copy()    # other rows share cov
     cov_world[2, 2] += heading_var
-    st.write_cov_attitude(row, par, cov_world, quat_to_matrix(quat),
-                          row[st.ROW_GYR:st.ROW_GYR + 3])
+    write_cov_attitude(row, p, cov_world, quat_to_matrix(quat))

@@ -6,12 +6,15 @@ final: each has seen between one and two lags of what followed it. A burst at a 
 limit is solved at once that way, live.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from imu_fusion.estimation.orientation.fixed_interval import smooth
-from imu_fusion.estimation.orientation.state import ORIENTATION_DTYPE, ROW_WORDS
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+
+_Portion = tuple[np.ndarray, np.ndarray]    # stamps (n,) int64 ns, values (n, 6) or (n, 3)
 
 
 @dataclass
@@ -19,13 +22,12 @@ class _Window:
     """The filter's state before the first sample, and what it was handed since."""
 
     start: int
-    x: np.ndarray
-    k: np.ndarray
-    imus: list = field(default_factory=list)    # (stamps (n,), samples (n, 6))
-    mags: list = field(default_factory=list)    # (stamps (m,), mags (m, 3))
+    state: np.ndarray
+    imus: list[_Portion] = field(default_factory=list)
+    mags: list[_Portion] = field(default_factory=list)
 
-    def copy(self):
-        return _Window(self.start, self.x, self.k, list(self.imus), list(self.mags))
+    def copy(self) -> "_Window":
+        return _Window(self.start, self.state, list(self.imus), list(self.mags))
 
 
 class FixedLag:
@@ -35,12 +37,12 @@ class FixedLag:
         lag: s.
     """
 
-    def __init__(self, lag):
+    def __init__(self, lag: float) -> None:
         self._lag = int(round(lag * 1e9))
-        self._windows = []
-        self._rows = []
+        self._windows: list[_Window] = []
+        self._rows: list[np.ndarray] = []
 
-    def copy(self):
+    def copy(self) -> "FixedLag":
         """One that goes on independently."""
         other = FixedLag(self._lag * 1e-9)
         other._windows = [window.copy() for window in self._windows]
@@ -48,53 +50,54 @@ class FixedLag:
         return other
 
     @property
-    def border(self):
+    def border(self) -> int:
         """Stamp (ns) from which on a sample belongs to the next window."""
         return self._windows[-1].start + self._lag if self._windows else 0
 
-    def cross(self, stamp, x, k, par):
+    def cross(self, stamp: int, state: np.ndarray, par: np.ndarray) -> None:
         """A window begins: the filter is about to take the sample of ``stamp`` >= border."""
         if len(self._windows) == 2:
             self._correct(par)
-        self._windows.append(_Window(stamp, x.copy(), k.copy()))
+        self._windows.append(_Window(stamp, state.copy()))
 
-    def add(self, stamps, samples, mag_stamps, mags):
-        """What the filter has taken in this window, in any portions."""
+    def add_imu(self, stamps: np.ndarray, samples: np.ndarray) -> None:
+        """Imu samples that the filter takes in this window, in any portions."""
         if len(stamps):
             self._windows[-1].imus.append((stamps, samples))
-        if len(mag_stamps) and self._windows:
-            self._windows[-1].mags.append((mag_stamps, mags))
 
-    def finish(self, par):
+    def add_mag(self, stamps: np.ndarray, mags: np.ndarray) -> None:
+        """Magnetometer samples, likewise."""
+        if len(stamps) and self._windows:
+            self._windows[-1].mags.append((stamps, mags))
+
+    def finish(self, par: np.ndarray) -> None:
         """The end: all that is left is corrected by what there is."""
         while self._windows:
             self._correct(par)
 
-    def keep(self, rows):
+    def keep(self, rows: np.ndarray) -> None:
         """Rows of before that nobody has taken yet."""
         self._rows.insert(0, rows)
 
-    def take(self):
+    def take(self) -> np.ndarray:
         """Corrected rows since the last call, ORIENTATION_DTYPE."""
         rows, self._rows = self._rows, []
         return np.concatenate([np.zeros(0, ORIENTATION_DTYPE), *rows])
 
-    def _correct(self, par):
+    def _correct(self, par: np.ndarray) -> None:
         first = self._windows.pop(0)
         windows = [first, *self._windows]
         stamps, samples = _joined([part for w in windows for part in w.imus], 6)
         mag_stamps, mags = _joined([part for w in windows for part in w.mags], 3)
         rows = np.zeros(len(stamps), ORIENTATION_DTYPE)
-        written = smooth(first.x, first.k, par, stamps, samples, mag_stamps, mags,
-                         rows.view(np.float64).reshape(-1, ROW_WORDS),
-                         rows.view(np.int64).reshape(-1, ROW_WORDS))
+        written = smooth(first.state, par, stamps, samples, mag_stamps, mags, rows)
         rows = rows[:written]
         if self._windows:
             rows = rows[rows["stamp"] < self._windows[0].start]
         self._rows.append(rows)
 
 
-def _joined(parts, width):
+def _joined(parts: Sequence[_Portion], width: int) -> _Portion:
     """Portions (stamps, values) as one."""
     return (np.concatenate([np.empty(0, np.int64), *(stamps for stamps, _ in parts)]),
             np.concatenate([np.empty((0, width)), *(values for _, values in parts)]))

@@ -1,4 +1,4 @@
-"""Orientation from gyroscope and magnetometer alone: Winkler 2025, eqs. (5)-(11).
+"""Orientation from gyroscope and magnetometer alone: Winkler 2025, eqs. (5)-(11), as printed.
 
 Per sample, the rotation over the step is the least-squares solution of the
 midpoint rule for the rates (6) and of the constancy of the field (8), solved by
@@ -6,41 +6,29 @@ Gauss-Newton. A covariance of [attitude error in world axes, gyroscope bias,
 field error relative to its norm] goes alongside: the gain of the paper is not the
 optimal one, so the covariance is updated in the form that holds for any gain.
 
-That is the method as printed: ``estimate_bias: false``. With ``estimate_bias`` (the
-default) the same two sets of rows are weighted by their covariances instead of by 2
-and w, and solved together with the slow states of gyroscope and magnetometer: that is
-the error-state filter of orientation_fusion without its accelerometer. Which of the
-two runs is settled by the parameters at the start.
+That is ``gyro_mag.as_printed``. Without it, method ``gyro_mag`` is the error-state filter (fusion)
+without its accelerometer: the same two sets of rows are weighted by their covariances instead of
+by 2 and w, and solved together with the slow states of gyroscope and magnetometer.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.orientation import fusion
-from imu_fusion.estimation.orientation.detect import find_limits, start_limits
-from imu_fusion.estimation.orientation.fusion_layout import LIMIT, P_ESTIMATE_BIAS, P_REST_FORCE
-from imu_fusion.estimation.orientation.state import (
-    ALIGN_UNTIL, FIELD, FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING,
-    FLAG_SATURATED, SATURATED_AXES_SHIFT, GAPS, GYR_BIAS, GYR_LAST, HEADING_KNOWN, LAST_STAMP, MAG_USED,
-    P_ACC_BIAS_SD, P_ACC_DENSITY, P_BIAS_WALK, P_GAP_RATE_SD, P_GYR_DENSITY,
-    P_MAG_SD, P_MAX_GAP, P_RELIABILITY, PENDING_COUNT, Q, SATURATED, STARTED,
-    TAKEN_WORDS, U, UNIFORM_VARIANCE, is_newer, mag_flags, push_mag, push_rotation,
-    take_mags, write_row)
+from imu_fusion.estimation.orientation import gyro_limit
+from imu_fusion.estimation.orientation import imu_rejection
+from imu_fusion.estimation.orientation import mag_queue
+from imu_fusion.estimation.orientation import rotation_history
+from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
+from imu_fusion.estimation.orientation.rows import (
+    FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING, FLAG_SATURATED,
+    SATURATED_AXES_SHIFT, write_attitude)
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse, quat_to_matrix,
-    right_jacobian, skew)
+    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
+    quat_to_matrix, right_jacobian, skew)
 
-COV = fusion.X_SIZE            # (9, 9): attitude, bias, relative field
-N = 9
-X_SIZE = COV + N * N
-AS_PRINTED = fusion.K_SIZE     # 1: Winkler (9) and nothing else
-WAS_CLIPPED = AS_PRINTED + 1   # bits of the axes at their limit at the step's start
-K_SIZE = AS_PRINTED + 2
-P_FIELD_SD, P_FIELD_TIME = fusion.P_SIZE, fusion.P_SIZE + 1
-P_SIZE = P_FIELD_TIME + 1
+N = 9    # of state.PRINTED: attitude, bias, relative field
 
 # Gauss-Newton converges quadratically from the gyroscope's own rotation; the
 # limit is reached only by steps of more than a radian.
@@ -48,38 +36,43 @@ _ITERATIONS = 8
 # Weight of a gyroscope row that is left out. The field's rows outweigh it but within half a
 # degree of the field's own direction.
 _DROPPED = 0.01
+_FIRST_DT = 1e-2           # s: step that stands in for the one before the first sample
 
 
-def pack(par, params):
-    """Write this kernel's own parameters (OrientationParams) behind the common ones."""
-    fusion.pack(par, replace(params, use_acc=False))
-    par[P_REST_FORCE] = math.inf   # rest, too, is judged without the accelerometer
-    par[P_FIELD_SD] = params.field_sd
-    par[P_FIELD_TIME] = params.field_time
-
-
-def initialise(x, k, par, alignment):
-    """Start from an Alignment. x, k: zeroed state."""
-    if par[P_ESTIMATE_BIAS]:
-        fusion.initialise(x, k, par, alignment)
-        return
-    start_limits(x, par)
-    k[AS_PRINTED] = 1
-    x[Q:Q + 4] = alignment.quat_world_imu
-    x[U:U + 4] = 0.0, 0.0, 0.0, 1.0
-    x[GYR_BIAS:GYR_BIAS + 3] = alignment.gyr_bias
-    k[HEADING_KNOWN] = alignment.has_heading
-    cov = x[COV:COV + N * N].reshape(N, N)
+def initialise(state, alignment):
+    """Start from an Alignment. state (1,): zeroed."""
+    s, printed = state[0], state[0]["printed"]
+    s["gyro_bias"] = alignment.gyr_bias
+    s["heading_known"] = alignment.has_heading
+    cov = printed["cov"]
     cov[:3, :3] = alignment.cov_attitude_world
     cov[3:6, 3:6] = np.eye(3) * alignment.gyr_bias_sd ** 2
     if alignment.has_heading:
-        x[FIELD:FIELD + 3] = alignment.field_world
+        printed["field_world"] = alignment.field_world
         # The field was turned to world axes by the initial attitude and shares its error:
         # the residual [b]x dtheta + d is zero at the start.
         b = skew(alignment.field_world / alignment.field_norm)
         cov[6:, 6:] = b @ cov[:3, :3] @ b.T
         cov[6:, :3] = -b @ cov[:3, :3]
         cov[:3, 6:] = cov[6:, :3].T
+
+
+EQUATION = np.dtype([
+    ("rate", "f8", 3), ("rate_next", "f8", 3),   # rad/s at both ends, each in its own imu axes
+    ("dt", "f8"),             # s
+    ("field", "f8", 3),       # expected field / B0, in the axes of the step's start
+    ("mag", "f8", 3),         # measured field / B0, in the axes of its end
+    ("weight", "f8"),         # w of (10), 0 without a sample
+    # Weight of each gyroscope axis: 1, or next to nothing. Not 0: a missing axis along the field is
+    # in no other row.
+    ("keep", "f8", 3),
+], align=True)
+"""The least-squares problem (9) of one step.
+
+The paper writes (9) in world axes; turned into those of the step's start it
+is the same least-squares problem with R_n = I. There a gyroscope axis is a row, which
+``keep`` can leave out where the axis is at its limit (appendix B).
+"""
 
 
 @njit
@@ -96,54 +89,53 @@ def _inverse3(m):
 
 
 @njit
-def solve_step(rate, rate_next, dt, field, mag, weight, keep, gain):
+def _normal_equations(eq, phi, j_mag, normal, rhs):
+    """Of (9) linearised at the rotation phi (3,): J'J, -J'f; j_mag gets the field's rows of J."""
+    dt, keep, weight = eq.dt, eq.keep, eq.weight
+    turn = quat_exp(phi, 1.0)
+    rate_end = quat_rotate(turn, eq.rate_next)
+    mag_start = quat_rotate(turn, eq.mag)
+    left = right_jacobian(-phi)
+    # d(Exp(phi) v) = -[Exp(phi) v]x J_left dphi
+    j_gyr = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            j_gyr[i, j] = -dt * keep[i] * (rate_end[a] * left[b, j] - rate_end[b] * left[a, j])
+            j_mag[i, j] = -weight * (mag_start[a] * left[b, j] - mag_start[b] * left[a, j])
+        j_gyr[i, i] -= 2.0 * keep[i]
+    for i in range(3):
+        rhs[i] = 0.0
+        for m in range(3):
+            f_gyr = keep[m] * (dt * (rate_end[m] + eq.rate[m]) - 2.0 * phi[m])
+            f_mag = weight * (mag_start[m] - eq.field[m])
+            rhs[i] -= j_gyr[m, i] * f_gyr + j_mag[m, i] * f_mag
+        for j in range(3):
+            normal[i, j] = 0.0
+            for m in range(3):
+                normal[i, j] += j_gyr[m, i] * j_gyr[m, j] + j_mag[m, i] * j_mag[m, j]
+
+
+@njit
+def solve_step(eq, gain):
     """Rotation over one step in the axes of its start: Winkler 2025 (9), Gauss-Newton.
 
-    The paper writes (9) in world axes; turned into those of the step's start it
-    is the same least-squares problem with R_n = I. There a gyroscope axis is a row, which
-    ``keep`` can leave out where the axis is at its limit (appendix B).
-
     Args:
-        rate, rate_next: (3,) rad/s at both ends, each in its own imu axes.
-        dt: s.
-        field: (3,) expected field / B0, in the axes of the start.
-        mag: (3,) measured field / B0, in the axes of the end.
-        weight: w of (10), 0 without a sample.
-        keep: (3,) weight of each gyroscope axis: 1, or next to nothing. Not 0: a missing axis
-            along the field is in no other row.
+        eq: an EQUATION.
         gain: (3, 3) out, attitude correction (axes of the start) per magnetic residual.
 
     Returns:
         (3,) rotation vector, rad.
     """
-    phi = 0.5 * dt * (rate + rate_next)
+    phi = np.empty(3)
+    for i in range(3):
+        phi[i] = 0.5 * eq.dt * (eq.rate[i] + eq.rate_next[i])
     normal = np.empty((3, 3))
     rhs = np.empty(3)
     inverse = np.eye(3)
     j_mag = np.zeros((3, 3))
     for _ in range(_ITERATIONS):
-        turn = quat_exp(phi)
-        rate_end = quat_rotate(turn, rate_next)
-        mag_start = quat_rotate(turn, mag)
-        left = right_jacobian(-phi)
-        # d(Exp(phi) v) = -[Exp(phi) v]x J_left dphi
-        j_gyr = np.zeros((3, 3))
-        for i in range(3):
-            for j in range(3):
-                a, b = (i + 1) % 3, (i + 2) % 3
-                j_gyr[i, j] = -dt * keep[i] * (rate_end[a] * left[b, j] - rate_end[b] * left[a, j])
-                j_mag[i, j] = -weight * (mag_start[a] * left[b, j] - mag_start[b] * left[a, j])
-            j_gyr[i, i] -= 2.0 * keep[i]
-        for i in range(3):
-            rhs[i] = 0.0
-            for m in range(3):
-                f_gyr = keep[m] * (dt * (rate_end[m] + rate[m]) - 2.0 * phi[m])
-                f_mag = weight * (mag_start[m] - field[m])
-                rhs[i] -= j_gyr[m, i] * f_gyr + j_mag[m, i] * f_mag
-            for j in range(3):
-                normal[i, j] = 0.0
-                for m in range(3):
-                    normal[i, j] += j_gyr[m, i] * j_gyr[m, j] + j_mag[m, i] * j_mag[m, j]
+        _normal_equations(eq, phi, j_mag, normal, rhs)
         inverse = _inverse3(normal)
         size = 0.0
         for i in range(3):
@@ -161,18 +153,18 @@ def solve_step(rate, rate_next, dt, field, mag, weight, keep, gain):
 
 
 @njit
-def _propagate(cov, r, dt, par, gap_variance):
+def _propagate(cov, r, dt, p, gap_variance):
     """Covariance over one step without correction. cov (9, 9) in place; r (3, 3)."""
-    keep = math.exp(-dt / par[P_FIELD_TIME])
+    keep = math.exp(-dt / p.gyro_mag.field_time)
     f = np.eye(N)
     for i in range(3):
         for j in range(3):
             f[i, 3 + j] = -r[i, j] * dt
         f[6 + i, 6 + i] = keep
     _transform(cov, f)
-    attitude = par[P_GYR_DENSITY] ** 2 * dt + gap_variance
-    bias = par[P_BIAS_WALK] ** 2 * dt
-    field = par[P_FIELD_SD] ** 2 * (1.0 - keep * keep)
+    attitude = p.sensor.gyro_noise_density ** 2 * dt + gap_variance
+    bias = p.sensor.gyro_bias_walk ** 2 * dt
+    field = p.gyro_mag.field_sd ** 2 * (1.0 - keep * keep)
     for i in range(3):
         cov[i, i] += attitude
         cov[3 + i, 3 + i] += bias
@@ -220,142 +212,151 @@ def _correct(cov, gain, b, weight, noise_sd):
 
 
 @njit
-def _step_as_printed(x, k, par, stamp, sample, row, row_int):
-    """step_imu with the rotation of (9)."""
-    if not is_newer(k, stamp, sample):
+def step(s, p, stamp, sample, row):
+    """One Imu sample through the method as printed; see fusion.step. Returns 0 or 1."""
+    if imu_rejection.is_refused(s, stamp, sample):
         return 0
-    gyr = sample[:3].copy()
-    acc = sample[3:6].copy()
-    cov = x[COV:COV + N * N].reshape(N, N)
-    bias = x[GYR_BIAS:GYR_BIAS + 3]
-    rate_next = gyr - bias
-    flags = mag_flags(k)
-    dt = 0.0
-    rate = rate_next
-    if k[STARTED]:
-        dt = (stamp - k[LAST_STAMP]) * 1e-9
-        rate = x[GYR_LAST:GYR_LAST + 3] - bias
-    push_rotation(x, k, stamp, quat_exp(rate + rate_next, 0.5 * dt))
-    k[LAST_STAMP] = stamp
-    k[STARTED] = 1
-    x[GYR_LAST:GYR_LAST + 3] = gyr
-
-    gap_variance = 0.0
-    if dt > par[P_MAX_GAP]:
-        flags |= FLAG_GAP
-        k[GAPS] += 1
-        gap_variance = min((par[P_GAP_RATE_SD] * dt) ** 2, UNIFORM_VARIANCE)
-    clipped = find_limits(x, k, par, gyr)
-    if clipped:
-        flags |= FLAG_SATURATED | clipped << SATURATED_AXES_SHIFT
-        k[SATURATED] += 1
-
-    # The step: gyroscope alone, or with the magnetometer samples that came.
-    samples = np.empty((k[PENDING_COUNT], TAKEN_WORDS))
-    taken = take_mags(x, k, samples)
-    b0 = math.sqrt(x[FIELD] ** 2 + x[FIELD + 1] ** 2 + x[FIELD + 2] ** 2)
-    weight = 0.0
-    reliability = np.nan
-    mag = np.full(3, np.nan)
-    field = np.zeros(3)
-    unit_mag = np.zeros(3)
-    quat = x[Q:Q + 4].copy()
-    if taken > 0:
-        mag[:] = 0.0
-        for i in range(taken):
-            mag += np.array(quat_rotate(samples[i, 6:10], samples[i, :3])) / taken
-    if taken > 0 and k[HEADING_KNOWN]:
-        norm = math.sqrt(mag[0] ** 2 + mag[1] ** 2 + mag[2] ** 2)
-        reliability = math.exp(-(par[P_RELIABILITY] * (b0 - norm) / b0) ** 2)
-        weight = reliability
-        unit_mag = mag / b0
-        field = np.array(quat_rotate_inverse(quat, x[FIELD:FIELD + 3])) / b0
+    equations = np.empty(1, EQUATION)
+    eq = equations[0]
+    gap_variance = _begin_step(s, p, stamp, sample, eq)
+    b0 = _weigh_mags(s, p, eq)
+    step, printed = s.step, s.printed
     # A step has two ends, and at either an axis can be at its limit.
-    missing = (clipped | k[WAS_CLIPPED]) if weight > 0.0 else 0
-    k[WAS_CLIPPED] = clipped
-    keep = np.ones(3)
+    missing = (step.clipped | printed.was_clipped) if eq.weight > 0.0 else 0
+    printed.was_clipped = step.clipped
     for i in range(3):
-        if (missing >> i) & 1:
-            keep[i] = _DROPPED
+        eq.keep[i] = _DROPPED if (missing >> i) & 1 else 1.0
     gain = np.zeros((3, 3))
-    phi = solve_step(rate, rate_next, dt, field, unit_mag, weight, keep, gain)
-    r = quat_to_matrix(quat_multiply(quat, quat_exp(phi, 0.5)))
-    _propagate(cov, r, dt, par, gap_variance)
-    for m in range(3):
-        if ((clipped | missing) >> m) & 1:
-            # It may be as far beyond its limit as this is from zero.
-            unseen = (x[LIMIT + m] * dt) ** 2
-            for i in range(3):
-                for j in range(3):
-                    cov[i, j] += r[i, m] * r[j, m] * unseen
-    x[Q:Q + 4] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
-    if weight > 0.0:
-        flags |= FLAG_MAG_USED
-        k[MAG_USED] += taken
-        r0 = quat_to_matrix(quat)
-        gain_world = np.zeros((3, 3))
-        for i in range(3):
-            for j in range(3):
-                for m in range(3):
-                    for n in range(3):
-                        gain_world[i, j] += r0[i, m] * gain[m, n] * r0[j, n]
-        _correct(cov, gain_world, x[FIELD:FIELD + 3] / b0, weight,
-                 par[P_MAG_SD] / (b0 * math.sqrt(taken)))
-    if not k[HEADING_KNOWN]:
-        flags |= FLAG_NO_HEADING
-    if stamp <= k[ALIGN_UNTIL]:
-        flags |= FLAG_ALIGNING
-
-    noise_dt = dt if dt > 0.0 else 1e-2
-    var_gyr = np.empty(3)
-    bias_var = np.empty(3)
-    for i in range(3):
-        bias_var[i] = cov[3 + i, 3 + i]
-        var_gyr[i] = par[P_GYR_DENSITY] ** 2 / noise_dt + bias_var[i]
-        if (clipped >> i) & 1:
-            var_gyr[i] += x[LIMIT + i] ** 2
-            if weight > 0.0 and dt > 0.0:
-                rate_next[i] = phi[i] / dt
-    write_row(row, row_int, par, stamp, x[Q:Q + 4], cov[:3, :3], rate_next, var_gyr, acc,
-              par[P_ACC_DENSITY] ** 2 / noise_dt + par[P_ACC_BIAS_SD] ** 2, bias, bias_var,
-              mag, reliability, flags, taken)
+    phi = solve_step(eq, gain)
+    middle = quat_to_matrix(quat_multiply(s.quat_world_imu, quat_exp(phi, 0.5)))
+    _propagate(printed.cov, middle, step.dt, p, gap_variance)
+    _allow_for_missing(s, middle, step.clipped | missing)
+    if eq.weight > 0.0:
+        step.flags |= FLAG_MAG_USED
+        s.counts.mag_used += step.mag_count
+        _correct_in_world(s, p, gain, eq.weight, b0)
+    s.quat_world_imu[:] = quat_normalize(quat_multiply(s.quat_world_imu, quat_exp(phi, 1.0)))
+    _write(s, p, row, eq, phi)
     return 1
 
 
 @njit
-def step_imu(x, k, par, stamp, sample, row, row_int):
-    """One Imu sample through the filter.
-
-    Args:
-        x, k, par: state and parameters, in place.
-        stamp: int64 ns.
-        sample: (6,) rate rad/s, specific force m/s^2.
-        row, row_int: float and integer view of the output row.
-
-    Returns:
-        1 if a row was written, 0 if the sample was refused (not finite, or not
-        newer than the last).
-    """
-    if not k[AS_PRINTED]:
-        return min(fusion.step_imu(x, k, par, stamp, sample, row, row_int), 1)
-    return _step_as_printed(x, k, par, stamp, sample, row, row_int)
+def _begin_step(s, p, stamp, sample, eq):
+    """Fill ``s.step`` with the sample, and the equation's rates. Returns the variance, rad^2, of
+    what may have gone unseen in a gap."""
+    step = s.step
+    step.flags = s.waiting_flags
+    s.waiting_flags = 0
+    for i in range(3):
+        step.gyr[i] = sample[i]
+        step.acc[i] = sample[3 + i]
+        eq.rate_next[i] = step.gyr[i] - s.gyro_bias[i]
+        eq.rate[i] = s.gyr_last[i] - s.gyro_bias[i] if s.started else eq.rate_next[i]
+        s.gyr_last[i] = step.gyr[i]
+    step.dt = eq.dt = (stamp - s.stamp) * 1e-9 if s.started else 0.0
+    twice = (eq.rate[0] + eq.rate_next[0], eq.rate[1] + eq.rate_next[1],
+             eq.rate[2] + eq.rate_next[2])
+    rotation_history.push(s.history, stamp, quat_exp(twice, 0.5 * step.dt))
+    s.stamp = stamp
+    s.started = True
+    gap_variance = 0.0
+    if step.dt > p.gap.max:
+        step.flags |= FLAG_GAP
+        s.counts.gaps += 1
+        gap_variance = min((p.gap.rate_sd * step.dt) ** 2, UNIFORM_VARIANCE)
+    step.clipped = gyro_limit.find(s.gyro_limit, p.sensor.gyro_range, step.gyr[:])
+    if step.clipped:
+        step.flags |= FLAG_SATURATED | step.clipped << SATURATED_AXES_SHIFT
+        s.counts.saturated += 1
+    return gap_variance
 
 
 @njit
-def run_loop(x, k, par, imu_stamps, samples, mag_stamps, mags, rows, rows_int):
-    """Whole logs in merge order: a magnetometer sample before the Imu of the same stamp.
+def _weigh_mags(s, p, eq):
+    """The magnetometer samples that came, as the field's part of the equation. Returns B0, T."""
+    step, expected = s.step, s.printed.field_world
+    b0 = math.sqrt(expected[0] ** 2 + expected[1] ** 2 + expected[2] ** 2)
+    taken = np.empty(s.queue.count, mag_queue.TAKEN)
+    count = mag_queue.take(s, taken)
+    step.mag_count = count
+    step.reliability = np.nan
+    eq.weight = 0.0
+    for i in range(3):
+        step.mag[i] = 0.0 if count > 0 else np.nan
+        eq.field[i] = eq.mag[i] = 0.0
+    for n in range(count):
+        now = quat_rotate(taken[n].turn, taken[n].field)
+        for i in range(3):
+            step.mag[i] += now[i] / count
+    if count > 0 and s.heading_known:
+        mag = step.mag
+        norm = math.sqrt(mag[0] ** 2 + mag[1] ** 2 + mag[2] ** 2)
+        step.reliability = math.exp(-(p.mag.reliability * (b0 - norm) / b0) ** 2)
+        eq.weight = step.reliability
+        there = quat_rotate_inverse(s.quat_world_imu, expected)
+        for i in range(3):
+            eq.mag[i] = mag[i] / b0
+            eq.field[i] = there[i] / b0
+    return b0
 
-    Returns the number of rows written.
-    """
-    written = 0
-    j = 0
-    for i in range(len(imu_stamps)):
-        while j < len(mag_stamps) and mag_stamps[j] <= imu_stamps[i]:
-            push_mag(x, k, par, mag_stamps[j], mags[j])
-            j += 1
-        written += step_imu(x, k, par, imu_stamps[i], samples[i], rows[written],
-                            rows_int[written])
-    while j < len(mag_stamps):
-        push_mag(x, k, par, mag_stamps[j], mags[j])
-        j += 1
-    return written
+
+@njit
+def _allow_for_missing(s, middle, missing):
+    """Axes (bits) at their limit may be as far beyond it as it is from zero."""
+    cov = s.printed.cov
+    for m in range(3):
+        if (missing >> m) & 1:
+            unseen = (s.gyro_limit.limit[m] * s.step.dt) ** 2
+            for i in range(3):
+                for j in range(3):
+                    cov[i, j] += middle[i, m] * middle[j, m] * unseen
+
+
+@njit
+def _correct_in_world(s, p, gain, weight, b0):
+    """:func:`_correct` by a gain (3, 3) in the axes of the step's start."""
+    r = quat_to_matrix(s.quat_world_imu)
+    gain_world = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for m in range(3):
+                for n in range(3):
+                    gain_world[i, j] += r[i, m] * gain[m, n] * r[j, n]
+    b = s.printed.field_world
+    _correct(s.printed.cov, gain_world, (b[0] / b0, b[1] / b0, b[2] / b0), weight,
+             p.sensor.mag_noise_sd / (b0 * math.sqrt(s.step.mag_count)))
+
+
+@njit
+def _write(s, p, row, eq, phi):
+    """The output row after a step by phi (3,)."""
+    step, cov = s.step, s.printed.cov
+    noise_dt = step.dt if step.dt > 0.0 else _FIRST_DT
+    row.stamp = s.stamp
+    cov_world = np.empty((3, 3))
+    for i in range(3):
+        bias_var = cov[3 + i, 3 + i]
+        rate = eq.rate_next[i]
+        var_gyr = p.sensor.gyro_noise_density ** 2 / noise_dt + bias_var
+        if (step.clipped >> i) & 1:
+            var_gyr += s.gyro_limit.limit[i] ** 2
+            if eq.weight > 0.0 and step.dt > 0.0:
+                rate = phi[i] / step.dt
+        for j in range(3):
+            cov_world[i, j] = cov[i, j]
+            row.cov_gyr[i, j] = row.cov_acc[i, j] = 0.0
+        row.gyr[i] = rate
+        row.cov_gyr[i, i] = var_gyr
+        row.acc[i] = step.acc[i]
+        row.cov_acc[i, i] = (p.sensor.acc_noise_density ** 2 / noise_dt
+                             + p.sensor.acc_bias_sd ** 2)
+        row.gyr_bias[i] = s.gyro_bias[i]
+        row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
+    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag)
+    row.reliability = step.reliability
+    row.mag_count = step.mag_count
+    if not s.heading_known:
+        step.flags |= FLAG_NO_HEADING
+    if s.stamp <= s.align_until:
+        step.flags |= FLAG_ALIGNING
+    row.flags = step.flags

@@ -4,20 +4,29 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import EstimationError, LayoutError, ParameterError, SampleError
-from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
-                                                      AccelerationFieldParams, GyroscopeParams,
-                                                      parse_configuration)
-from imu_fusion.estimation.acceleration_field.layout import (AccelerometerParams, make_layout,
-                                                             nine_accelerometer_package)
-from imu_fusion.estimation.acceleration_field.rows import (GAP, HELD, MISSING, SATURATED,
-                                                           field_at)
-from imu_fusion.simulation.rigid_body_impact import (PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS,
-                                                     ImpactScene, simulate)
+from imu_fusion.errors import EstimationError, LayoutError, SampleError
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
+from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, MISSING, SATURATED, field_at
+from imu_fusion.estimation.acceleration_field.sensor_array import (
+    make_sensor_array,
+    nine_accelerometer_package,
+)
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_PARTICLE,
+    PAPER_POSITIONS,
+    ImpactScene,
+    simulate,
+)
 
 GIVEN = AccelerationFieldParams(
-    initial__mode="given", initial__angular_velocity=(5.0, 5.0, 5.0),
-    initial__angular_velocity_sd=1e-6, gravity=9.8)
+    initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=1e-6),
+    gravity=9.8)
 METHODS = [{"method": "ao"}, {"method": "sqrt_ao"}, {"method": "rigid_body"},
            {"method": "rigid_body", "mode": "smoothed"}]
 
@@ -67,7 +76,8 @@ def test_magnitude_of_the_field_needs_no_orientation(motion):
     readings = motion.readings(PAPER_POSITIONS, PAPER_AXES)
     turned = tuple(Rotation.from_rotvec([0.3, -1.0, 2.0]).as_quat())
     plain, other = (AccelerationFieldEstimator(
-        GIVEN.replace(method="ao", initial__orientation=q), sensors()).run(motion.stamp, readings)
+        GIVEN.replace(**{"method": "ao", "initial.orientation": q}), sensors()).run(
+            motion.stamp, readings)
         for q in ((0, 0, 0, 1), turned))
     assert np.array_equal(plain["specific_force"], other["specific_force"])
     force = field_at(plain, PAPER_PARTICLE, 9.8)[0][:, 0]
@@ -80,7 +90,7 @@ def test_gradient_worked_by_hand():
     # at (x, y, z) the acceleration is (1 - 4 x - 3 y, 3 x - 4 y, 0).
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     readings = np.array([[1, 0, 0], [-3, 3, 0], [-2, -4, 0], [1, 0, 0.0]])
-    params = GIVEN.replace(method="ao", initial__angular_velocity=(0.0, 0.0, 2.0))
+    params = GIVEN.replace(**{"method": "ao", "initial.angular_velocity": (0.0, 0.0, 2.0)})
     row = AccelerationFieldEstimator(params, sensors(positions, [np.eye(3)] * 4,
                                                      reports="acceleration")).add(0, readings)[0]
     assert np.allclose(row["gradient"], [[-4, -3, 0], [3, -4, 0], [0, 0, 0]], atol=1e-12)
@@ -120,7 +130,9 @@ def test_other_layouts(motion, name, method):
         for axis, letter in enumerate("xyz"):
             if letter not in sensor.measured_axes:
                 readings[:, k, axis] = np.nan
-    params = GIVEN.replace(method=method, integration="high_order", max_condition=1e4)
+    params = GIVEN.replace(method=method, max_condition=1e4)
+    if method == "ao":
+        params = params.replace(integration="high_order")
     rows = AccelerationFieldEstimator(params, layout).run(motion.stamp, readings)
     assert max(errors(motion, rows, [0.02, 0.01, 0.03])) < 0.1
     assert np.all(rows["flags"] == 0)
@@ -149,15 +161,13 @@ def test_degenerate_layouts_are_refused(positions, method, word):
 
 def test_bad_sensors_are_refused():
     with pytest.raises(LayoutError, match="not orthonormal"):
-        make_layout([AccelerometerParams(axes=(1, 0, 0, 0.1, 1, 0, 0, 0, 1))])
+        make_sensor_array([AccelerometerParams(axes=(1, 0, 0, 0.1, 1, 0, 0, 0, 1))])
     with pytest.raises(LayoutError, match="specific force"):
-        make_layout([AccelerometerParams(), AccelerometerParams(reports="acceleration")])
+        make_sensor_array([AccelerometerParams(), AccelerometerParams(reports="acceleration")])
     with pytest.raises(LayoutError, match="twice"):
-        make_layout([AccelerometerParams(measured_axes=("x", "x"))])
+        make_sensor_array([AccelerometerParams(measured_axes=("x", "x"))])
     with pytest.raises(LayoutError, match="accelerometers.names"):
-        make_layout([])
-    with pytest.raises(EstimationError, match="rigid_body"):
-        AccelerationFieldEstimator(GIVEN.replace(method="ao"), sensors(), GyroscopeParams())
+        make_sensor_array([])
 
 
 @pytest.mark.parametrize("change", METHODS, ids=lambda c: "-".join(c.values()))
@@ -167,7 +177,10 @@ def test_live_batch_and_interrupted_runs_agree_bit_for_bit(motion, change):
     readings[40, 2] = np.nan
     stamp = motion.stamp[:300]
     params = GIVEN.replace(**change)
-    make = lambda: AccelerationFieldEstimator(params, sensors(noise_density=1e-2, bias_sd=0.1))
+
+    def make():
+        return AccelerationFieldEstimator(params, sensors(noise_density=1e-2, bias_sd=0.1))
+
     batch = make().run(stamp, readings)
     live = make()
     rows = [live.add(s, r) for s, r in zip(stamp[:120], readings[:120])]
@@ -192,7 +205,7 @@ def test_missing_and_saturated_channels_are_left_out(motion, change):
     clipped = np.any(np.abs(readings[:, 5]) >= limit, axis=1)
     readings[:, 5] = np.clip(readings[:, 5], -limit, limit)
     layout = sensors(positions, axes)
-    layout[5] = layout[5].replace(range=limit)
+    layout[5] = layout[5].replace(range=(limit,))
     rows = AccelerationFieldEstimator(GIVEN.replace(**change), layout).run(motion.stamp, readings)
     assert np.array_equal(rows["flags"] & SATURATED > 0, clipped)
     assert np.array_equal(np.flatnonzero(rows["flags"] & MISSING), np.arange(100, 110))
@@ -289,27 +302,12 @@ def test_rest_waits_until_the_body_is_still(motion):
             motion.stamp, motion.readings(PAPER_POSITIONS, PAPER_AXES))
 
 
-def test_configuration_from_a_mapping():
-    values = {"accelerometers": {"names": ["a", "b", "c"],
-                                 "a": {"position": [0, 0, 0]}, "b": {"position": [0.1, 0, 0]},
-                                 "c": {"position": [0, 0.1, 0], "reports": "specific_force"}},
-              "method": "rigid_body", "gyroscope.range": 17.0}
-    params, accelerometers, gyroscope = parse_configuration(values)
-    assert list(accelerometers) == ["a", "b", "c"] and gyroscope.range == 17.0
-    assert accelerometers["b"].position == (0.1, 0.0, 0.0)
-    AccelerationFieldEstimator(params, accelerometers, gyroscope)
-    with pytest.raises(ParameterError, match="noise_densty"):
-        parse_configuration({**values, "accelerometers.a.noise_densty": 1.0})
-    with pytest.raises(ParameterError, match="accelerometers.d"):
-        parse_configuration({**values, "accelerometers.d.range": 1.0})
-
-
 def test_sphere_scene_keeps_a_constant_rate_forever():
     # A torque-free sphere turns steadily: an hour of orientation within the noise-free limits.
     scene = ImpactScene(semi_axes=(0.1, 0.1, 0.1), ground=-1e9, omega=(0.0, 0.0, 3.0),
                         velocity=(0, 0, 0))
     motion = simulate(scene, duration=2.0)
-    params = GIVEN.replace(method="ao", initial__angular_velocity=(0.0, 0.0, 3.0))
+    params = GIVEN.replace(**{"method": "ao", "initial.angular_velocity": (0.0, 0.0, 3.0)})
     rows = AccelerationFieldEstimator(params, sensors()).run(
         motion.stamp, motion.readings(PAPER_POSITIONS, PAPER_AXES))
     angle = Rotation.from_quat(rows["quat"]).as_rotvec()

@@ -6,12 +6,24 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import SampleError
-from imu_fusion.estimation.acceleration_field.estimator import (AccelerationFieldEstimator,
-                                                      AccelerationFieldParams)
-from imu_fusion.estimation.acceleration_field.layout import AccelerometerParams
-from imu_fusion.estimation.acceleration_field.impact_metrics import (STANDARD_GRAVITY, ImpactParams, bric,
-                                                  channel_filter, damage, find_events, gambit,
-                                                  hic, measure_impacts, sustained_level)
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.impact_metrics import (
+    STANDARD_GRAVITY,
+    ImpactParams,
+    bric,
+    channel_filter,
+    damage,
+    find_events,
+    gambit,
+    hic,
+    measure_impacts,
+    sustained_level,
+)
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
 T = np.arange(2001) * 1e-4
@@ -116,8 +128,8 @@ def test_pyisomme_agrees():
 def test_events_have_pretrigger_and_do_not_overlap():
     magnitude = np.zeros_like(T)
     for at in (0.05, 0.08, 0.15):
-        magnitude[(T >= at - 1e-9) & (T < at + 0.002)] = 200.0
-    events = find_events(T, magnitude, ImpactParams(impact__before=0.01, impact__duration=0.06))
+        magnitude[(at - 1e-9 <= T) & (at + 0.002 > T)] = 200.0
+    events = find_events(T, magnitude, ImpactParams(before=0.01, duration=0.06))
     assert [(T[e][0], T[e][-1]) for e in events] == [
         (pytest.approx(0.04, abs=2e-4), pytest.approx(0.10, abs=2e-4)),
         (pytest.approx(0.14, abs=2e-4), pytest.approx(0.20, abs=2e-4))]
@@ -129,8 +141,7 @@ def impact():
     sensors = [AccelerometerParams(position=tuple(p), axes=tuple(a.ravel()), noise_density=1e-6,
                                    bias_sd=0.0) for p, a in zip(PAPER_POSITIONS, PAPER_AXES)]
     params = AccelerationFieldParams(
-        method="ao", initial__mode="given", initial__angular_velocity=(5.0, 5.0, 5.0),
-        gravity=9.8)
+        method="ao", initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0)), gravity=9.8)
     rows = AccelerationFieldEstimator(params, sensors).run(
         motion.stamp, motion.readings(PAPER_POSITIONS, PAPER_AXES))
     return motion, rows
@@ -139,7 +150,7 @@ def impact():
 def test_metrics_of_the_simulated_impact(impact):
     motion, rows = impact
     center = (0.0, 0.0, 0.75)
-    found = measure_impacts(rows, [center, (0.1, 0, 0.75)], 9.8, ImpactParams(impact__trigger=20.0))
+    found = measure_impacts(rows, [center, (0.1, 0, 0.75)], 9.8, ImpactParams(trigger=20.0))
     assert [f["point"][0] for f in found] == [0.0, 0.1]
     first = found[0]
     event = (motion.t >= first["begin_s"]) & (motion.t <= first["begin_s"] + 0.2)
@@ -158,7 +169,8 @@ def test_metrics_of_the_simulated_impact(impact):
 
 def test_axes_matter_for_damage_only(impact):
     _, rows = impact
-    plain, j211 = (measure_impacts(rows, [(0, 0, 0.75)], 9.8, ImpactParams(impact__trigger=20.0, impact__axes=a))[0]
+    plain, j211 = (measure_impacts(rows, [(0, 0, 0.75)], 9.8,
+                                   ImpactParams(trigger=20.0, axes=a))[0]
                    for a in ("rep103", "j211"))
     assert plain["damage"] != pytest.approx(j211["damage"], rel=1e-3)
     for name in ("hic15", "bric", "gambit", "peak_velocity_change"):
@@ -167,10 +179,15 @@ def test_axes_matter_for_damage_only(impact):
 
 def test_channel_class_is_recorded_and_uneven_records_are_refused(impact):
     _, rows = impact
-    found = measure_impacts(rows, [], 9.8, ImpactParams(impact__trigger=20.0, impact__linear_class=60))
+    found = measure_impacts(rows, [], 9.8, ImpactParams(trigger=20.0, linear_class=60))
     assert found[0]["linear_class"] == 60 and found[0]["angular_class"] is None
     inside = np.searchsorted(rows["stamp"], found[0]["stamp"]) + 50
     (uneven,) = measure_impacts(np.delete(rows, inside), [], 9.8, ImpactParams(
-        impact__trigger=20.0))[:1]
+        trigger=20.0))[:1]
     assert "not even" in uneven["refused"] and "hic15" not in uneven
     assert measure_impacts(rows[:2], [], 9.8) == []
+
+
+def test_impacts_that_are_not_looked_for_are_not_found(impact):
+    assert measure_impacts(impact[1], [], 9.8, ImpactParams(trigger=20.0))
+    assert measure_impacts(impact[1], [], 9.8, ImpactParams(trigger=20.0, detect=False)) == []

@@ -10,11 +10,16 @@ from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.orientation.estimator import (
     ORIENTATION_DTYPE, OrientationEstimator, OrientationParams)
 from imu_fusion.estimation.orientation.alignment import triad
-from imu_fusion.estimation.orientation.state import FLAG_ALIGNING, FLAG_GAP
+from imu_fusion.estimation.orientation.rows import FLAG_ALIGNING, FLAG_GAP
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 
 NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
+
+
+def make(changes):
+    """An estimator whose parameters differ from the defaults by ``changes``, dotted names."""
+    return OrientationEstimator(OrientationParams.from_mapping(changes))
 
 
 def errors_deg(rows, truth):
@@ -24,10 +29,10 @@ def errors_deg(rows, truth):
 
 
 @pytest.fixture(scope="module", params=[
-    dict(method="gyro_mag"), dict(method="gyro_mag", estimate_bias=False), dict(method="fusion")],
+    dict(method="gyro_mag"), {"method": "gyro_mag", "gyro_mag.as_printed": True}, dict(method="fusion")],
     ids=["gyro_mag", "as printed", "fusion"])
 def params(request):
-    return OrientationParams(**request.param)
+    return OrientationParams.from_mapping(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +183,7 @@ def test_rows_have_the_promised_layout(params, recording):
 
 def test_parameters_are_refused_by_name():
     with pytest.raises(ParameterError, match="gyro_range"):
-        OrientationParams(gyro_range=(1.0, 2.0))
+        OrientationParams.from_mapping({"sensor.gyro_range": (1.0, 2.0)})
 
 
 def test_a_delay_that_is_not_given_is_part_of_the_covariance_while_turning():
@@ -189,9 +194,9 @@ def test_a_delay_that_is_not_given_is_part_of_the_covariance_while_turning():
     imu = ImuLog(imu.stamp + later, imu.gyr, imu.acc)
     mag = MagLog(mag.stamp + later, mag.mag)
     shares = {}
-    for name, changes in (("unset", {}), ("wrong", dict(gyro_delay=0.0)),
-                          ("given", dict(gyro_delay=0.004))):
-        rows = OrientationEstimator(OrientationParams(axes_sd=1e-3, **changes)).run(imu, mag)
+    for name, changes in (("unset", {}), ("wrong", {"sensor.gyro_delay": 0.0}),
+                          ("given", {"sensor.gyro_delay": 0.004})):
+        rows = make({"sensor.axes_sd": 1e-3, **changes}).run(imu, mag)
         want = simulate(Tumbling(seed=1, rate_sd=3.0), 20.0, rate=200.0, seed=2)[2]
         want = Rotation.from_quat(want.quat_world_imu) * Rotation.from_rotvec(0.004 * rows["gyr"])
         error = (Rotation.from_quat(rows["quat_world_imu"]).inv() * want).as_rotvec()

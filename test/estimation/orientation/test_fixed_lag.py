@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
-from test.estimation.orientation.test_estimator import NOISY, feed
+from test.estimation.orientation.test_estimator import NOISY, feed, make
 
 LAG = OrientationParams(lag=0.7)
 
@@ -80,7 +80,7 @@ def test_bursts_at_the_limit_are_solved_at_once_and_soon():
     sensors = Sensors(gyr_density=2e-4, acc_density=2e-3, mag_sd=3e-7, gyr_limit=6.0)
     imu, mag, truth, rates = simulate(Tumbling(seed=21, rate_sd=5.0), 25.0, rate=200.0,
                                       sensors=sensors, seed=2)
-    estimator = OrientationEstimator(OrientationParams(lag=0.5, gyro_range=(6.0,)))
+    estimator = make({"lag": 0.5, "sensor.gyro_range": (6.0,)})
     rows, again = corrected(estimator, imu, mag)
     clipped = np.abs(imu.gyr) >= 6.0
     rate = [np.sqrt(((r["gyr"] - rates)[clipped] ** 2).mean()) for r in (rows, again)]
@@ -89,14 +89,14 @@ def test_bursts_at_the_limit_are_solved_at_once_and_soon():
              for r in (rows, again)]
     # 0.51 to 0.32 rad/s and 8.5 to 4.4 deg (other seeds: by a factor of 0.5 to 0.6, 0.75 to 0.8).
     assert rate[1] < 0.7 * rate[0] and angle[1] < 0.7 * angle[0]
-    # Half of what the causal filter did while it took the excess for a random walk.
+    # Half of what the causal filter did while it took the clipped rate for a random walk.
     assert rate[1] < 0.4 and np.degrees(angle[1]) < 5.5
 
 
 def test_a_lag_needs_the_causal_fusion_filter():
     for changes in (dict(method="gyro_mag"), dict(mode="smoothed")):
         with pytest.raises(ParameterError, match="'lag'"):
-            OrientationParams(lag=1.0, **changes)
+            OrientationParams.from_mapping({"lag": 1.0, **changes})
 
 
 def test_a_magnetometer_alone_is_not_hoarded(recording):

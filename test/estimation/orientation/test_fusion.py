@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
-from imu_fusion.estimation.orientation.state import (
+from imu_fusion.estimation.orientation.rows import (
     FLAG_HELD, FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
 from imu_fusion.parameters.file import load
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import saturated_axes
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
+from test.estimation.orientation.test_estimator import make
 
 CONFIG = Path(__file__).parents[3] / "config"
 MATRIX = ((1.004, 0.003, 0.0), (-0.002, 0.997, 0.001), (0.0, 0.003, 1.002))
@@ -46,13 +47,13 @@ def ordinary():
 
 @pytest.fixture(scope="module")
 def causal(ordinary):
-    estimator = OrientationEstimator(OrientationParams(axes_sd=0.0))
+    estimator = make({"sensor.axes_sd": 0.0})
     return estimator.run(*ordinary[:2]), estimator
 
 
 @pytest.fixture(scope="module")
 def smoothed(ordinary):
-    return OrientationEstimator(OrientationParams(mode="smoothed", axes_sd=0.0)).run(*ordinary[:2])
+    return make({"mode": "smoothed", "sensor.axes_sd": 0.0}).run(*ordinary[:2])
 
 
 def test_bias_and_delay_are_found(causal):
@@ -96,8 +97,8 @@ def test_covariance_is_honest(mode):
             mag_delay=float(rng.normal(0.0, 0.01)))
         imu, mag, truth, _ = simulate(Tumbling(seed=seed), 20.0, rate=100.0, sensors=sensors,
                                       seed=seed)
-        rows = OrientationEstimator(OrientationParams(
-            mode=mode, axes_sd=0.0, gyro_delay=0.0, heading_anchor="field")).run(imu, mag)
+        rows = make({"mode": mode, "sensor.axes_sd": 0.0, "sensor.gyro_delay": 0.0,
+                     "alignment.heading_anchor": "field"}).run(imu, mag)
         d = local_errors(rows, truth)
         distances.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(rows["cov_attitude"]), d))
     distances = np.concatenate(distances)
@@ -184,9 +185,9 @@ def test_without_the_accelerometer_impacts_do_no_harm(ordinary):
     imu, mag, truth, _ = ordinary
     shaken = imu.acc.copy()
     shaken[600:] = np.random.default_rng(0).normal(0, 100.0, shaken[600:].shape)
-    rows = OrientationEstimator(OrientationParams(use_acc=False)).run(
+    rows = make({"fusion.use_acc": False}).run(
         ImuLog(imu.stamp, imu.gyr, shaken), mag)
-    same = OrientationEstimator(OrientationParams(use_acc=False)).run(imu, mag)
+    same = make({"fusion.use_acc": False}).run(imu, mag)
     assert rmse_deg(rows, truth) < 3.0
     assert rmse_deg(same, truth) == pytest.approx(rmse_deg(rows, truth), abs=0.3)
 
@@ -224,7 +225,7 @@ def test_start_in_motion_at_the_limit(rate, limit):
     assert at[:int(rate)].any()
     for mode in ("causal", "smoothed"):
         # Magnetometer samples of before the first Imu sample tell nothing of the present.
-        rows = OrientationEstimator(OrientationParams(mode=mode, gyro_range=(limit,))).run(
+        rows = make({"mode": mode, "sensor.gyro_range": (limit,)}).run(
             imu[keep], mag)
         error = local_errors(rows, truth[keep])
         assert np.linalg.eigvalsh(rows["cov_attitude"]).min() > 0.0
@@ -265,7 +266,7 @@ def test_bursts_beyond_the_limit_are_solved():
     after = np.sqrt(((result["smoothed"]["gyr"] - rates)[clipped] ** 2).mean())
     assert after < 0.2 * before
     # Beside the same filter that takes clipped rates for true ones.
-    blind = OrientationEstimator(OrientationParams(gyro_range=(1e3,))).run(imu, mag)
+    blind = make({"sensor.gyro_range": (1e3,)}).run(imu, mag)
     assert rmse_deg(result["causal"], truth) < 0.4 * rmse_deg(blind, truth)
     assert rmse_deg(result["smoothed"], truth) < 0.4 * rmse_deg(result["causal"], truth)
 
@@ -307,7 +308,7 @@ def test_a_sudden_turn_is_motion_and_none_of_it_is_lost():
     gyr = np.zeros((n, 3))
     gyr[600:620, 2] = 20.0
     force = np.tile([0.0, 0.0, 9.81], (n, 1))
-    rows = OrientationEstimator(OrientationParams(gyro_scale_sd=0.0)).run(ImuLog(stamp, gyr, force))
+    rows = make({"sensor.gyro_scale_sd": 0.0}).run(ImuLog(stamp, gyr, force))
     held = np.flatnonzero(rows["flags"] & FLAG_HELD)
     assert 600 in held and len(held) <= 2
     yaw = np.unwrap(Rotation.from_quat(rows["quat_world_imu"]).as_euler("ZYX")[:, 0])
@@ -319,7 +320,7 @@ def test_bias_estimation_can_be_switched_off(ordinary):
     imu, mag, _, _ = ordinary
     estimator = OrientationEstimator()
     first = estimator.run(imu[:2000], mag[:2000])
-    estimator.set_params(OrientationParams(estimate_bias=False))
+    estimator.set_params(OrientationParams.from_mapping({"fusion.estimate_bias": False}))
     rows = estimator.run(imu[2000:4000], mag[2000:4000])
     assert (rows["gyr_bias"] == first["gyr_bias"][-1]).all()
     with pytest.raises(ParameterError, match="method"):
@@ -349,7 +350,7 @@ def test_magnetometer_ahead_of_the_gyroscope_is_used():
     for rate, lead in ((286.0, 0.03), (1000.0, 0.09)):
         imu, mag, truth, _ = simulate(Tumbling(seed=5), 6.0, rate=rate,
                                       sensors=Sensors(mag_delay=-lead, mag_sd=3e-7))
-        estimator = OrientationEstimator(OrientationParams(mag_delay=-lead, max_mag_lag=0.2))
+        estimator = make({"sensor.mag_delay": -lead, "mag.max_latency": 0.2})
         estimator.run(imu, mag)
         summary = estimator.summary()
         waiting = int(lead * rate) + 3      # and the sample before the first Imu
@@ -366,11 +367,11 @@ def test_lag_stays_within_belief_and_samples_in_use():
     lost = slice(start, start + 286)
     # What the sensor will show 60 ms later, for one second: a lag of six standard deviations.
     false[lost] = mag.mag[start + 17:start + 17 + 286]
-    params = OrientationParams(mag_delay_sd=0.01)
+    params = OrientationParams.from_mapping({"sensor.mag_delay_sd": 0.01})
     estimator = OrientationEstimator(params)
     rows = estimator.run(imu, MagLog(mag.stamp, false))
     lag = estimator.summary()["mag_delay"]
-    assert abs(lag) <= 3 * params.mag_delay_sd
+    assert abs(lag) <= 3 * params.sensor.mag_delay_sd
     assert (rows["mag_count"][-286:] > 0).mean() > 0.99
 
 
@@ -381,23 +382,22 @@ def test_iron_left_over_is_part_of_the_heading_that_rest_anchors():
     iron = 0.03 * np.linalg.norm(field)
     motion = Tumbling(seed=4, quat_start=(0.0, 0.0, 0.0, 1.0))
     imu, mag, truth, _ = simulate(motion, 2.0, sensors=Sensors(mag_offset=(iron, 0.0, 0.0)))
-    rows = OrientationEstimator(OrientationParams(mag_matrix_sd=0.0)).run(imu, mag)
+    rows = make({"fusion.mag_matrix_sd": 0.0}).run(imu, mag)
     error = local_errors(rows, truth)[-1] @ up
     sd = math.sqrt(rows["cov_attitude"][-1][2, 2])
     assert abs(abs(error) - math.atan2(iron, north)) < math.radians(0.3)
     assert 0.5 < abs(error) / sd < 1.5
-    calibrated = OrientationParams(mag_matrix_sd=0.0, mag_offset_sd=0.0)
-    rows = OrientationEstimator(calibrated).run(imu, mag)
+    rows = make({"fusion.mag_matrix_sd": 0.0, "fusion.mag_offset_sd": 0.0}).run(imu, mag)
     assert math.sqrt(rows["cov_attitude"][-1][2, 2]) < math.radians(1.5)
 
 
 VEHICLE = load(CONFIG / "orientation_vehicle.yaml")["orientation_estimator"]
-PHONE_GRADE = {k: VEHICLE[k] for k in ("acc_bias_sd", "gyro_scale_sd", "gyro_bias_walk")}
+PHONE_GRADE = {"sensor": VEHICLE["sensor"]}
 
 
 def on_a_vehicle(seed):
     """Speeds of some 10 m/s that last for some 10 s, sensors drawn from the preset."""
-    p = OrientationParams(**VEHICLE)
+    p = OrientationParams.from_mapping(VEHICLE).sensor
     rng = np.random.default_rng(seed)
     sensors = Sensors(
         gyr_density=p.gyro_noise_density, acc_density=p.acc_noise_density,
@@ -417,7 +417,7 @@ def test_tilt_on_a_vehicle_is_as_good_as_stated(told, mode):
     ratios = []
     for seed in range(10):
         imu, truth = on_a_vehicle(seed)
-        rows = OrientationEstimator(OrientationParams(mode=mode, **told)).run(imu)
+        rows = make({"mode": mode, **told}).run(imu)
         world = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
         cov = world @ rows["cov_attitude"] @ world.transpose(0, 2, 1)
         variance = np.degrees(1) ** 2 * (cov[:, 0, 0] + cov[:, 1, 1])

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
-from imu_fusion.estimation.orientation.state import FLAG_ALIGNING, FLAG_GAP
+from imu_fusion.estimation.orientation.rows import FLAG_ALIGNING, FLAG_GAP
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.simulation.rotation import Tumbling, simulate
-from test.estimation.orientation.test_estimator import NOISY, errors_deg, feed
+from test.estimation.orientation.test_estimator import NOISY, errors_deg, feed, make
 
 HOUR = 3_600_000_000_000
 CUT = 25.0
@@ -33,7 +33,7 @@ def recording():
                                      dict(method="gyro_mag")])
 def test_a_clock_that_jumps_ahead_starts_anew(recording, changes):
     imu, mag, truth, first = recording
-    estimator = OrientationEstimator(OrientationParams(**changes))
+    estimator = make(changes)
     rows = np.concatenate([estimator.run(imu, mag), estimator.finish()])
     if "lag" in changes:
         rows = estimator.take_corrected()
@@ -51,7 +51,7 @@ def test_a_clock_that_jumps_ahead_starts_anew(recording, changes):
 @pytest.mark.parametrize("changes", [dict(), dict(lag=0.5), dict(method="gyro_mag")])
 def test_stream_batch_and_pieces_are_the_same(recording, changes):
     imu, mag, _, first = recording
-    params = OrientationParams(**changes)
+    params = OrientationParams.from_mapping(changes)
     whole = OrientationEstimator(params)
     rows = np.concatenate([whole.run(imu, mag), whole.finish()])
     live = OrientationEstimator(params)
@@ -77,7 +77,7 @@ def test_without_a_magnetometer_the_yaw_of_before_is_kept():
     gyr = np.zeros((n, 3))
     gyr[200:300, 2] = math.radians(70.0)
     force = np.tile([0.0, 0.0, 9.81], (n, 1))
-    rows = OrientationEstimator(OrientationParams(gyro_scale_sd=0.0)).run(
+    rows = make({"sensor.gyro_scale_sd": 0.0}).run(
         ImuLog(stamp, gyr, force))
     yaw = Rotation.from_quat(rows["quat_world_imu"]).as_euler("ZYX", degrees=True)[:, 0]
     assert abs(yaw[599]) > 60.0

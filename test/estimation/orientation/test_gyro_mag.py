@@ -8,19 +8,22 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
-from imu_fusion.estimation.orientation.state import FLAG_SATURATED
+from imu_fusion.estimation.orientation.rows import FLAG_SATURATED
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.sensors.saturation import saturated_axes
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from test.estimation.orientation.test_estimator import make
 
 MATRIX = ((1.004, 0.003, 0.0), (-0.002, 0.997, 0.001), (0.0, 0.003, 1.002))
 ORDINARY = Sensors(gyr_density=2e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005),
                    gyr_matrix=MATRIX, mag_delay=0.011)
 
 
-def run(imu, mag, **changes):
-    return OrientationEstimator(OrientationParams(method="gyro_mag", axes_sd=0.0, **changes)).run(
-        imu, mag)
+PRINTED = {"gyro_mag.as_printed": True}
+
+
+def run(imu, mag, changes={}):
+    return make({"method": "gyro_mag", "sensor.axes_sd": 0.0, **changes}).run(imu, mag)
 
 
 def local_errors(rows, truth):
@@ -40,7 +43,7 @@ def ordinary():
 
 def test_without_estimation_a_step_is_the_printed_least_squares(ordinary):
     imu, mag, _, _ = ordinary
-    rows = run(imu[:1000], mag[:1000], estimate_bias=False)
+    rows = run(imu[:1000], mag[:1000], PRINTED)
     bias = rows["gyr_bias"][0]
     first = Rotation.from_quat(rows["quat_world_imu"][0])
     # The field and B0 of (9) are the alignment's: the mean over its interval at rest.
@@ -71,16 +74,16 @@ def test_scale_bias_and_delay_are_found(ordinary):
     estimator = OrientationEstimator(OrientationParams(method="gyro_mag"))
     rows = estimator.run(imu, mag)
     assert estimator.summary()["mag_delay"] == pytest.approx(0.011, abs=2e-3)
-    assert rmse_deg(rows, truth) < 0.5 * rmse_deg(run(imu, mag, estimate_bias=False), truth)
+    assert rmse_deg(rows, truth) < 0.5 * rmse_deg(run(imu, mag, PRINTED), truth)
 
 
-@pytest.mark.parametrize("estimate_bias", [True, False])
-def test_the_accelerometer_counts_in_the_start_alone(ordinary, estimate_bias):
+@pytest.mark.parametrize("changes", [{}, PRINTED])
+def test_the_accelerometer_counts_in_the_start_alone(ordinary, changes):
     imu, mag, _, _ = ordinary
     shaken = imu.acc.copy()
     shaken[110:] = np.random.default_rng(0).normal(0, 100.0, shaken[110:].shape)
-    first = run(imu, mag, estimate_bias=estimate_bias)
-    second = run(ImuLog(imu.stamp, imu.gyr, shaken), mag, estimate_bias=estimate_bias)
+    first = run(imu, mag, changes)
+    second = run(ImuLog(imu.stamp, imu.gyr, shaken), mag, changes)
     for name in ("quat_world_imu", "cov_attitude", "gyr", "gyr_bias", "flags"):
         assert (first[name] == second[name]).all(), name
 
@@ -93,7 +96,7 @@ def test_axes_at_their_limit_are_carried_by_the_field():
     rows = run(imu, mag)
     flagged = (rows["flags"] & FLAG_SATURATED) != 0
     assert not flagged[~saturated_axes(imu.gyr, 6.0).any(axis=1)].any()
-    blind = run(imu, mag, gyro_range=(1e3,))
+    blind = run(imu, mag, {"sensor.gyro_range": (1e3,)})
     assert rmse_deg(rows, truth) < 0.4 * rmse_deg(blind, truth)
     error = [np.sqrt(((r["gyr"] - rates)[clipped] ** 2).mean()) for r in (rows, blind)]
     assert error[0] < 0.5 * error[1]
@@ -107,15 +110,16 @@ def test_as_printed_drops_the_rows_of_axes_at_their_limit(limit, axes):
                                       sensors=Sensors(gyr_limit=limit))
     clipped = np.abs(imu.gyr) >= limit
     assert clipped.sum(axis=1).max() == axes
-    rows = run(imu, mag, estimate_bias=False, gyro_range=(limit,))
-    blind = run(imu, mag, estimate_bias=False, gyro_range=(1e3,))
+    told = PRINTED | {"sensor.gyro_range": (limit,)}
+    rows = run(imu, mag, told)
+    blind = run(imu, mag, PRINTED | {"sensor.gyro_range": (1e3,)})
     # Without noise an axis is lost only where it points along the field.
     assert rmse_deg(rows, truth) < 0.2 * rmse_deg(blind, truth)
     errors = [(r["gyr"] - rates)[clipped] for r in (rows, blind)]
     assert np.sqrt((errors[0] ** 2).mean()) < 0.1 * np.sqrt((errors[1] ** 2).mean())
     noisy, mag, truth, rates = simulate(motion, 10.0, rate=200.0, seed=2,
                                         sensors=Sensors(gyr_limit=limit, mag_sd=3e-7))
-    rows = run(noisy, mag, estimate_bias=False, gyro_range=(limit,))
+    rows = run(noisy, mag, told)
     sd = np.sqrt(np.einsum("nii->ni", rows["cov_gyr"]))
     # The noise of one sample is 3e-7 T sqrt(2) / (48e-6 T dt) = 1.8 rad/s: worse, and said so.
     assert (np.abs(rows["gyr"] - rates) < 3.0 * sd)[clipped].mean() > 0.97

@@ -5,21 +5,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.estimation.orientation import mag_limit as limit
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
-from imu_fusion.estimation.orientation.state import FLAG_MAG_SATURATED, FLAG_MAG_USED
+from imu_fusion.estimation.orientation.mag_rejection import are_saturated
+from imu_fusion.estimation.orientation.params import kernel_parameters
+from imu_fusion.estimation.orientation.rows import FLAG_MAG_SATURATED, FLAG_MAG_USED
+from imu_fusion.estimation.orientation.state import MAG_LIMIT
 from imu_fusion.samples.logs import MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from test.estimation.orientation.test_estimator import make
 
 RANGE = 130e-6
 STEP = 0.3e-6      # a 12-bit or 16-bit sensor of 130 to 4900 uT
 NOISY = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7)
 
 
-def screen(mags, ranges=(np.nan,) * 3):
+def screen(mags, ranges=None):
     """Mask of the samples taken for saturated."""
-    floats, ints = np.zeros(limit.FLOATS), np.zeros(limit.INTS, dtype=np.int64)
-    return np.array([limit.is_saturated(floats, ints, np.array(ranges), m) for m in mags])
+    params = OrientationParams.from_mapping({"sensor.mag_range": ranges})
+    return are_saturated(np.zeros(1, MAG_LIMIT), kernel_parameters(params), mags)
 
 
 def quantised(mags, step=STEP):
@@ -88,7 +91,7 @@ def test_a_larger_value_shows_that_a_limit_was_none():
 @pytest.mark.parametrize("method", ["fusion", "gyro_mag"])
 def test_saturated_samples_are_no_field(near_iron, method):
     imu, mag, beyond, _ = near_iron
-    given = OrientationEstimator(OrientationParams(method=method, mag_range=(RANGE - STEP,)))
+    given = make({"method": method, "sensor.mag_range": (RANGE - STEP,)})
     rows = given.run(imu, mag)
     saturated = (np.abs(mag.mag) >= RANGE - STEP).any(axis=1)
     assert given.summary()["mag_saturated"] == saturated.sum()
@@ -105,8 +108,8 @@ def test_saturated_samples_are_no_field(near_iron, method):
 def test_the_range_is_that_of_the_sensor_before_calibration(near_iron):
     imu, mag, _, _ = near_iron
     shifted = MagLog(mag.stamp, mag.mag + [500e-6, 0.0, 0.0])
-    estimator = OrientationEstimator(OrientationParams(
-        mag_range=(520e-6, 1.0, 1.0), mag_offset=(500e-6, 0.0, 0.0)))
+    estimator = make({"sensor.mag_range": (520e-6, 1.0, 1.0),
+                      "sensor.mag_offset": (500e-6, 0.0, 0.0)})
     estimator.run(imu, shifted)
     # Without the sample before the first Imu, which the kernel does not see.
     assert estimator.summary()["mag_saturated"] == (shifted.mag[1:, 0] >= 520e-6).sum()
@@ -120,7 +123,7 @@ def test_alignment_leaves_saturated_samples_and_outliers_out():
     broken[101] = [1e30, 0.0, 0.0]
     broken[102] = 0.0
     for mode in ("causal", "smoothed"):
-        rows = OrientationEstimator(OrientationParams(mode=mode, mag_range=(2e-3,))).run(
+        rows = make({"mode": mode, "sensor.mag_range": (2e-3,)}).run(
             imu, MagLog(mag.stamp, broken))
         error = (Rotation.from_quat(rows["quat_world_imu"]).inv()
                  * Rotation.from_quat(truth.quat_world_imu)).magnitude()
@@ -129,7 +132,7 @@ def test_alignment_leaves_saturated_samples_and_outliers_out():
 
 def test_all_at_the_limit_leaves_the_heading_unknown(near_iron):
     imu, mag, _, _ = near_iron
-    estimator = OrientationEstimator(OrientationParams(mag_range=(1e-6,)))
+    estimator = make({"sensor.mag_range": (1e-6,)})
     rows = estimator.run(imu, mag)
     assert len(rows) == len(imu) and not estimator.summary()["has_heading"]
     assert estimator.summary()["mag_saturated"] == len(mag) - 1   # not that before the first Imu
@@ -147,5 +150,6 @@ def test_smoothing_counts_each_sample_once(near_iron):
 def test_one_or_three_elements_in_tesla():
     for wrong in ((1e-3, 1e-3), (-1e-3,)):
         with pytest.raises(ParameterError, match="mag_range"):
-            OrientationParams(mag_range=wrong)
-    assert OrientationParams(mag_range=(1e-3, 2e-3, 3e-3)).mag_range == (1e-3, 2e-3, 3e-3)
+            OrientationParams.from_mapping({"sensor.mag_range": wrong})
+    three = OrientationParams.from_mapping({"sensor.mag_range": (1e-3, 2e-3, 3e-3)})
+    assert three.sensor.mag_range == (1e-3, 2e-3, 3e-3)

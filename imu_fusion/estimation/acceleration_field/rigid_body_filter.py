@@ -1,0 +1,143 @@
+"""The causal filter of the rigid-body model: an extended Kalman filter."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
+from imu_fusion.estimation.acceleration_field.measurement import Trace, make_trace, update
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ALPHA,
+    BIAS,
+    OMEGA,
+    THETA,
+    State,
+    Step,
+    motion_step,
+    parts,
+    predict,
+    reopen,
+)
+from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
+from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_row, rigid_gradient
+from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
+from imu_fusion.estimation.acceleration_field.start import Start
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
+from imu_fusion.kernels import njit
+
+
+@njit
+def _make_step():
+    return Step(np.full(1, -1.0), np.empty((4, 4)), np.empty((4, 4)))
+
+
+@njit
+def _predict_to(stamp, state, p, channels, step, trace, n):
+    """Move the State to a stamp (ns), in place; the Trace gets sample n. Returns GAP or 0.
+
+    step: the last Step, used again if it is as long.
+    """
+    trace.dt[n] = 0.0
+    flags = 0
+    if state.last[0] >= 0:
+        dt = (stamp - state.last[0]) * 1e-9
+        if dt > p.gap.max:
+            flags = GAP
+            reopen(state.x, state.cov, dt, p.spread)
+            trace.phi[n] = 0.0
+            trace.dt[n] = -dt
+        else:
+            if dt != step.dt[0]:
+                step.dt[0] = dt
+                step.chain[:], step.noise[:] = motion_step(dt, p.motion.rate)
+            trace.phi[n] = predict(state, p, channels, step)
+            trace.dt[n] = dt
+    state.last[0] = stamp
+    return flags
+
+
+@njit
+def _fold(state):
+    """Take theta into the quaternion."""
+    state.quat[:] = quat_normalize(quat_multiply(state.quat, quat_exp(state.x[THETA:OMEGA])))
+    state.x[THETA:OMEGA] = 0.0
+
+
+@njit
+def filter_samples(state, par, channels, stamp, readings, rows, trace):
+    """Filter n samples in order, in place; one of ``rows`` (n,) ROW each.
+
+    par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, stamp: (n,) int64 ns,
+    readings: (n, m), trace: a Trace of one sample, to work in.
+    """
+    p = par[0]
+    step = _make_step()
+    only = np.int64(0)   # a literal 0 would compile what is called once more
+    for n in range(len(stamp)):
+        flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
+        found = update(state, p, channels, readings[n], state.x[OMEGA:ALPHA].copy(), trace, only)
+        _fold(state)
+        flags |= found.flags
+        residual = math.nan
+        if found.used > 0:
+            residual = math.sqrt(found.squares / found.used)
+        else:
+            flags |= HELD
+        s = parts(state.x)
+        row = rows[n]
+        row.stamp = stamp[n]
+        row.flags = flags
+        row.residual_rms = residual
+        put_row(row, p, state.quat, s.omega, s.alpha, s.acc,
+                np.ascontiguousarray(state.cov[:BIAS, :BIAS]), rigid_gradient(s.omega, s.alpha))
+
+
+@njit
+def trace_samples(state, par, channels, stamp, readings, at, trace):
+    """As :func:`filter_samples`, but for the smoother: keeps a Trace of all n samples.
+
+    at: (n, 3) angular velocities to linearise at, or (0, 3): at each prediction. Returns the
+    log likelihood of the readings.
+    """
+    p = par[0]
+    step = _make_step()
+    likelihood = 0.0
+    for n in range(len(stamp)):
+        _predict_to(stamp[n], state, p, channels, step, trace, n)
+        where = at[n].copy() if len(at) > 0 else state.x[OMEGA:ALPHA].copy()
+        likelihood += update(state, p, channels, readings[n], where, trace, n).log_likelihood
+        trace.x[n] = state.x
+        trace.cov[n] = state.cov
+        _fold(state)
+    return likelihood
+
+
+class RigidBodyFilter:
+    """The filter with its memory: a start, then samples in order."""
+
+    def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start):
+        self._par = kernel_params(params, array)
+        self._channels = array.channels
+        self._one = make_trace(1, len(array.channels))
+        self.state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
+                           np.array([-1], dtype=np.int64))
+
+    def get_state(self) -> NamedTuple:
+        """A copy of the memory, for :meth:`set_state`."""
+        return State(*(member.copy() for member in self.state))
+
+    def set_state(self, state: NamedTuple) -> None:
+        """Go on from where :meth:`get_state` was called."""
+        self.state = State(*(member.copy() for member in state))
+
+    def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
+        """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
+        rows = np.empty(len(stamp), ROW)
+        filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._one)
+        return rows
+
+    def trace(self, stamp: np.ndarray, readings: np.ndarray, at: np.ndarray,
+              trace: Trace) -> float:
+        """:func:`trace_samples` with this filter's memory."""
+        return trace_samples(self.state, self._par, self._channels, stamp, readings, at, trace)

@@ -1,0 +1,104 @@
+"""The compiled core that live and batch share: samples in, rows out, one loop for both methods.
+
+Every function takes the state (1,) of :data:`state.STATE`, changed in place, and the parameters
+(1,) of :func:`params.kernel_parameters`.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from imu_fusion.kernels import entry_point, njit
+
+from imu_fusion.estimation.orientation import fusion
+from imu_fusion.estimation.orientation import gyro_limit
+from imu_fusion.estimation.orientation import gyro_mag
+from imu_fusion.estimation.orientation import mag_queue
+from imu_fusion.estimation.orientation.alignment import Alignment
+from imu_fusion.estimation.orientation.error_state import TAPE
+from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.state import new_state
+
+CURSOR = np.dtype([("imu", "i8"), ("mag", "i8"), ("row", "i8")])
+"""How far :func:`forward` is: samples taken of both logs, rows written."""
+
+
+def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None:
+    """Start a zeroed state from an Alignment."""
+    state["quat_world_imu"] = alignment.quat_world_imu
+    state["history"]["quat"] = 0.0, 0.0, 0.0, 1.0
+    _start_limits(state, par)
+    if par["as_printed"][0]:
+        gyro_mag.initialise(state, alignment)
+    else:
+        fusion.initialise(state, par, alignment)
+
+
+@njit
+def _start_limits(state, par):
+    gyro_limit.start(state[0].gyro_limit, par[0].sensor.gyro_range)
+
+
+@njit
+def push_mag(state, par, stamp, mag):
+    """Take one magnetometer sample: int64 ns, (3,) tesla as the sensor reports it."""
+    mag_queue.push(state[0], par[0], stamp, mag)
+
+
+@njit
+def step_imu(state, par, stamp, sample, rows):
+    """One Imu sample: int64 ns, (6,) rate rad/s and specific force m/s^2.
+
+    rows: (1,) ORIENTATION_DTYPE, gets the row. Returns 0 if the sample was refused, else 1 or 2.
+    """
+    if par[0].as_printed:
+        return gyro_mag.step(state[0], par[0], stamp, sample, rows[0])
+    return fusion.step(state[0], par[0], stamp, sample, rows[0], np.empty(0, TAPE))
+
+
+@cache
+def live_calls() -> tuple[Callable, Callable]:
+    """:func:`step_imu` and :func:`push_mag` as live streams call them, a sample at a time."""
+    state, par = new_state(), kernel_parameters(OrientationParams())
+    return (entry_point(step_imu, state, par, 0, np.zeros(6), np.zeros(1, ORIENTATION_DTYPE)),
+            entry_point(push_mag, state, par, 0, np.zeros(3)))
+
+
+@njit
+def forward(state, par, stamps, samples, mag_stamps, mags, cursor, rows, tapes):
+    """Whole logs in merge order: a magnetometer sample before the Imu of the same stamp.
+
+    Args:
+        stamps: (n,) int64 ns. samples: (n, 6). mag_stamps: (m,) int64 ns. mags: (m, 3).
+        cursor: (1,) CURSOR, where to begin; gets where it ended.
+        rows: (n,) ORIENTATION_DTYPE, written from ``cursor.row`` on.
+        tapes: (k,) error_state.TAPE, one per block, for the smoother: the filter stops when all
+            are full. Empty: nothing is recorded, and it goes on to the end.
+
+    Returns:
+        Blocks on tape.
+    """
+    s, p, at = state[0], par[0], cursor[0]
+    blocks = 0
+    while at.imu < len(stamps) and (blocks < len(tapes) or len(tapes) == 0):
+        while at.mag < len(mag_stamps) and mag_stamps[at.mag] <= stamps[at.imu]:
+            mag_queue.push(s, p, mag_stamps[at.mag], mags[at.mag])
+            at.mag += 1
+        tape = tapes[blocks:blocks + 1]
+        if p.as_printed:
+            result = gyro_mag.step(s, p, stamps[at.imu], samples[at.imu], rows[at.row])
+        else:
+            result = fusion.step(s, p, stamps[at.imu], samples[at.imu], rows[at.row], tape)
+        if result > 0:
+            at.row += 1
+        if result == 2 and len(tape) > 0:
+            tape[0].stamp = stamps[at.imu]
+            tape[0].row_end = at.row
+            blocks += 1
+        at.imu += 1
+    if at.imu == len(stamps):
+        while at.mag < len(mag_stamps):
+            mag_queue.push(s, p, mag_stamps[at.mag], mags[at.mag])
+            at.mag += 1
+    return blocks

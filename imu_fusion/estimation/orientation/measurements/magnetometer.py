@@ -1,0 +1,210 @@
+"""The magnetometer in the fusion filter: first field, heading, the samples of a block.
+
+The field in world axes is constant but for a drift, and for a local part that is frozen while
+the sensor rests and forgotten as it moves. Samples weigh less the more their norm deviates, and
+the more they differ from what was expected.
+"""
+
+import math
+
+import numpy as np
+from imu_fusion.kernels import njit
+
+from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.geometry.rotation import (
+    quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix)
+
+NAME = "magnetometer"
+_FIRST_FIELD_SD = 2e-3     # relative: noise of the field that the alignment averages
+_HORIZONTAL_SHARE = 0.02   # of the field; below, heading is noise: the magnetic poles
+_WHITE_TIME = 0.02         # s: faster sampling of the same disturbance is no news
+# Degrees of freedom of the residual's distribution. Few, since the errors of a field indoors
+# are no Gaussian's; from 3 to 9 nothing depends on it.
+_TAIL_DOF = 5.0
+# Columns: attitude (2), field, local field, lag, offset (3), matrix (9).
+_LAG, _OFFSET, _MATRIX, _COLUMNS = 4, 5, 8, 17
+
+
+@njit
+def start_field(s, p, z, has_heading, follow):
+    """Begin the field states with ``z`` (3,) tesla, measured here and now, world axes.
+
+    The first sample makes the field share the tilt's error. With ``has_heading`` the
+    heading has no error but a constant one, or with ``follow`` = 1 one that is known as well
+    as tilt and calibration, and is corrected when these are.
+    """
+    cov = s.cov
+    s.field_norm = math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2)
+    b = (z[0] / s.field_norm, z[1] / s.field_norm, z[2] / s.field_norm)
+    for i in range(3):
+        s.field[i] = b[i]
+    for i in range(es.FIELD, es.MAG_OFFSET):
+        cov[i, :] = 0.0
+        cov[:, i] = 0.0
+        cov[i, i] = 1.0 if i < es.LOCAL_FIELD else p.fusion.local_field_sd ** 2
+    if has_heading:
+        cov[es.ATTITUDE + 2, es.ATTITUDE + 2] += follow
+        # What is left of hard and soft iron turns the needle and stays in the heading.
+        iron = ((p.fusion.mag_offset_sd ** 2 + p.fusion.mag_matrix_sd ** 2)
+                / max(b[0] ** 2 + b[1] ** 2, 1e-4))
+        s.heading_var = min(p.heading_sd ** 2 + iron, es.UNIFORM_VARIANCE) * (1.0 - follow)
+        s.heading_known = True
+    _share_errors(s, p, b, has_heading, follow)
+
+
+@njit
+def _share_errors(s, p, b, has_heading, follow):
+    """Updates that make field, attitude and calibration share the first sample's error."""
+    r = quat_to_matrix(s.quat_world_imu)
+    m = quat_rotate_inverse(s.quat_world_imu, b)
+    rows = np.empty(1, es.ROW)
+    row = rows[0]
+    error = np.zeros(es.N)
+    no_tape = np.empty(0, es.TAPE)
+    row.residual, row.variance = 0.0, _FIRST_FIELD_SD ** 2
+    for i in range(3):
+        _put_columns(row, i, b)
+        row.coefficient[_LAG] = 0.0
+        for c in range(3):
+            row.coefficient[_OFFSET + c] = r[i, c] * follow
+            for d in range(3):
+                row.coefficient[_MATRIX + 3 * c + d] = r[i, c] * m[d] * follow
+        es.update(s.cov, error, es.N, row, no_tape)
+    if has_heading and follow:
+        # The needle points to azimuth D: nothing across it.
+        row.count = 4
+        for c in range(2):
+            row.index[c], row.index[2 + c] = es.FIELD + c, es.LOCAL_FIELD + c
+        row.coefficient[0] = row.coefficient[2] = math.cos(p.declination)
+        row.coefficient[1] = row.coefficient[3] = -math.sin(p.declination)
+        es.update(s.cov, error, es.N, row, no_tape)
+
+
+@njit
+def _put_columns(row, i, field):
+    """Columns of component i of the field: attitude, field and local field; indices of all."""
+    j, m = (i + 1) % 3, (i + 2) % 3
+    row.count = _COLUMNS
+    row.index[0], row.coefficient[0] = es.ATTITUDE + m, field[j]
+    row.index[1], row.coefficient[1] = es.ATTITUDE + j, -field[m]
+    row.index[2], row.coefficient[2] = es.FIELD + i, 1.0
+    row.index[3], row.coefficient[3] = es.LOCAL_FIELD + i, 1.0
+    row.index[_LAG] = es.MAG_LAG
+    for c in range(3):
+        row.index[_OFFSET + c] = es.MAG_OFFSET + c
+    for c in range(9):
+        row.index[_MATRIX + c] = es.MAG_MATRIX + c
+
+
+@njit
+def _fix_heading(s, p, z):
+    """Turn the world about up so that ``z`` (3,) tesla, world axes, points magnetic north."""
+    s.world_turned = True
+    horizontal = math.hypot(z[0], z[1])
+    norm = math.sqrt(horizontal ** 2 + z[2] ** 2)
+    known = horizontal >= _HORIZONTAL_SHARE * norm
+    # The needle points to azimuth D: east sin D, north cos D.
+    angle = 0.5 * math.pi - p.declination - math.atan2(z[1], z[0]) if known else 0.0
+    turn = quat_exp((0.0, 0.0, angle), 1.0)
+    s.quat_world_imu[:] = quat_multiply(turn, s.quat_world_imu)
+    s.velocity[:] = quat_rotate(turn, s.velocity)
+    s.position[:] = quat_rotate(turn, s.position)
+    cov = s.cov
+    for group in (es.ATTITUDE, es.VELOCITY, es.POSITION):
+        for j in range(es.N):
+            cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j])
+        for j in range(es.N):
+            cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3])
+    # The sensor may be moving: what it shows now is no anchor.
+    start_field(s, p, quat_rotate(turn, z), known, 1.0 if known else 0.0)
+
+
+@njit
+def _calibrated(s, raw):
+    """A sample relative to the field's norm, less offset and soft iron as known so far: a tuple."""
+    offset, matrix = s.mag_offset, s.mag_matrix
+    return (raw[0] - offset[0] - matrix[0, 0] * raw[0] - matrix[0, 1] * raw[1]
+            - matrix[0, 2] * raw[2],
+            raw[1] - offset[1] - matrix[1, 0] * raw[0] - matrix[1, 1] * raw[1]
+            - matrix[1, 2] * raw[2],
+            raw[2] - offset[2] - matrix[2, 0] * raw[0] - matrix[2, 1] * raw[1]
+            - matrix[2, 2] * raw[2])
+
+
+@njit
+def collect(s, p, taken, count):
+    """Add magnetometer samples to the block.
+
+    taken: mag_queue.TAKEN (count,), at least one. Their mean in present imu axes goes to
+    ``s.step.mag``, its weight (10) to ``s.step.reliability``.
+    """
+    if s.field_norm == 0.0:
+        _fix_heading(s, p, quat_rotate(quat_multiply(s.quat_world_imu, taken[0].turn),
+                                       taken[0].field))
+    norm, total, quat = s.field_norm, s.mag_sum, s.quat_world_imu
+    mean = (0.0, 0.0, 0.0)
+    for n in range(count):
+        sample = taken[n]
+        raw = (sample.field[0] / norm, sample.field[1] / norm, sample.field[2] / norm)
+        m = _calibrated(s, raw)
+        rate = sample.rate
+        r = quat_to_matrix(quat_multiply(quat, sample.turn))
+        drag = (rate[1] * m[2] - rate[2] * m[1], rate[2] * m[0] - rate[0] * m[2],
+                rate[0] * m[1] - rate[1] * m[0])
+        for i in range(3):
+            for j in range(3):
+                total.field[i] += r[i, j] * m[j]
+                total.lag[i] += r[i, j] * drag[j]
+                total.offset[i, j] += r[i, j]
+                for c in range(3):
+                    total.matrix[i, 3 * j + c] += r[i, j] * raw[c]
+        now = quat_rotate(sample.turn, m)
+        mean = (mean[0] + now[0] / count, mean[1] + now[1] / count, mean[2] + now[2] / count)
+        total.count += 1
+    for i in range(3):
+        s.step.mag[i] = mean[i] * norm
+    size = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
+    s.step.reliability = math.exp(-(p.mag.reliability * (1.0 - size)) ** 2)
+
+
+@njit
+def field(s, p, error, rows):
+    """Rows (3,) of the block's mean sample against the field.
+
+    The noise is Student's t: the further the sample is from what was expected (error (N,): the
+    error state so far), the less it weighs, however its norm may look.
+    """
+    total = s.mag_sum
+    count = total.count
+    z = (total.field[0] / count, total.field[1] / count, total.field[2] / count)
+    expected = (s.field[0] + s.local_field[0], s.field[1] + s.local_field[1],
+                s.field[2] + s.local_field[2])
+    deviation = abs(math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2) - 1.0)
+    sd = p.fusion.mag_disturbance_sd + p.fusion.norm_deviation_factor * deviation
+    variance = (sd * sd * max(_WHITE_TIME / s.block.time, 1.0 / count)
+                + (p.sensor.mag_noise_sd / s.field_norm) ** 2 / count)
+    distance = 0.0
+    for i in range(3):
+        row = rows[i]
+        _put_columns(row, i, expected)
+        row.residual = z[i] - expected[i]
+        row.coefficient[_LAG] = total.lag[i] / count
+        for c in range(3):
+            row.coefficient[_OFFSET + c] = total.offset[i, c] / count
+        for c in range(9):
+            row.coefficient[_MATRIX + c] = total.matrix[i, c] / count
+        distance += _distance(s.cov, error, row, variance)
+    variance *= (_TAIL_DOF + distance) / (_TAIL_DOF + 3.0)
+    for i in range(3):
+        rows[i].variance = variance
+
+
+@njit
+def _distance(cov, error, row, variance):
+    """Squared innovation of one row over its variance."""
+    residual = row.residual
+    for a in range(_COLUMNS):
+        residual -= row.coefficient[a] * error[row.index[a]]
+        for b in range(_COLUMNS):
+            variance += row.coefficient[a] * row.coefficient[b] * cov[row.index[a], row.index[b]]
+    return residual * residual / variance
