@@ -5,7 +5,13 @@ from std_srvs.srv import Trigger
 from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
 from imu_fusion.streams.acceleration_field import (
-    NODE, NODE_PARAMETERS, OUTPUTS, SENSOR_PREFIXES, AccelerationFieldStream, FieldConfiguration)
+    NODE,
+    NODE_PARAMETERS,
+    OUTPUTS,
+    SENSOR_PREFIXES,
+    AccelerationFieldStream,
+    FieldConfiguration,
+)
 
 
 class AccelerationFieldEstimatorNode(EstimatorNode):

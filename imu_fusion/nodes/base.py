@@ -89,7 +89,7 @@ class Node(rclpy.node.Node):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
                          **kwargs)
         self.finished = False
-        self.problems: list[str] = []  # what should not have happened: the exit code is then 1
+        self.problems: list[str] = []  # texts: why the exit code is 1
         self._params = self._declare(params_files)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -118,7 +118,8 @@ class Node(rclpy.node.Node):
             level, message, values = status()
             array = DiagnosticArray(status=[DiagnosticStatus(
                 level=level, name=f"{self.get_fully_qualified_name().lstrip('/')}: {task}",
-                message=message, hardware_id="imu_fusion", values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
+                message=message, hardware_id="imu_fusion",
+                values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
             array.header.stamp = self.get_clock().now().to_msg()
             publisher.publish(array)
 

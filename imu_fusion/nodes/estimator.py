@@ -11,7 +11,7 @@ from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
-from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream, one_by_one
+from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream
 
 _FAREWELL = 2.0  # s, in which a node that was asked to stop ends its session
 
@@ -66,8 +66,10 @@ class EstimatorNode(Node):
 
     def publish(self, made: Sequence[Messages]) -> None:
         """Publish what the stream has made."""
-        for topic, _, cdr in one_by_one(made):
-            self._outputs[topic].publish(cdr)
+        for part in made:
+            output = self._outputs[part.topic]
+            for cdr in part.cdrs:
+                output.publish(cdr)
 
     def stop(self) -> None:
         """End the session, so that whoever listens knows; wait for that only briefly."""

@@ -10,12 +10,16 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import ImuFusionError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
-from imu_fusion.streams.orientation import (ORIENTATION_TOPIC, OUTPUTS,
-                                                    OrientationOutputParams, OrientationStream,
-                                                    warm_up)
-from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.nodes.base import run_node
 from imu_fusion.nodes.estimator import EstimatorNode
+from imu_fusion.streams.orientation import (
+    ORIENTATION_TOPIC,
+    OUTPUTS,
+    OrientationOutputParams,
+    OrientationStream,
+    warm_up,
+)
+from imu_fusion.streams.stream import EstimatorNodeParams
 
 
 def transform_broadcast(node):

@@ -5,6 +5,7 @@ import multiprocessing
 import sys
 import time
 import traceback
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -13,14 +14,20 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.kernels import announced_compiling
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother.result import SAMPLE
-from imu_fusion.streams import smoother as smoothing
-from imu_fusion.streams.smoother import (INPUTS, OUTPUTS, PER_SAMPLE, SmootherStream,
-                                           SmootherNodeParams, SmoothingParams)
+from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
+from imu_fusion.streams import smoother as smoothing
+from imu_fusion.streams.smoother import (
+    INPUTS,
+    OUTPUTS,
+    PER_SAMPLE,
+    SmootherNodeParams,
+    SmootherStream,
+    SmoothingParams,
+)
 from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
 
@@ -63,7 +70,8 @@ class _Child:
                                       args=(theirs, params, logs))
         self._process.start()
         theirs.close()
-        self.outcome = self.samples = None  # an Outcome, or the reason why there is none
+        self.samples: Any = None
+        self.outcome: Any = None  # an Outcome, or the reason why there is none
         self._received = 0
 
     def poll(self):
@@ -122,7 +130,8 @@ class SmootherNode(Node):
             load_surface(surface_file)  # a bad file ends the node now
         self._outputs = {topic: self._flow.output(message_class(msgtype), topic, _latched(1))
                          for topic, msgtype in OUTPUTS.items()}
-        self._child = self._answer = self._result = self._messages = None
+        self._child: Any = None
+        self._answer = self._result = self._messages = None
         # Reentrant: a second call is answered while the first one still waits.
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())

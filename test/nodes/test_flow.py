@@ -188,7 +188,7 @@ def test_short_sessions_one_after_the_other_with_new_receivers_lose_nothing(grap
         receiver = Receiver(graph, topic="/doubled")
         sender = Sender(graph, wait_for=["receiver", "doubler"])
         sender.session(count)
-        graph.until(lambda: receiver.ended and sender.source.drained())
+        graph.until(lambda r=receiver, s=sender: r.ended and s.source.drained())
         assert receiver.values == twice(count)
         assert not receiver.flow.problems and not sender.flow.problems
         for part in (receiver, sender):

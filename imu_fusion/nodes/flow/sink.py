@@ -3,10 +3,12 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
 from imu_fusion.nodes.flow.peers import Peer, Peers
 from imu_fusion.nodes.flow.qos import made, reliable_qos, session_qos
@@ -81,6 +83,7 @@ class Input:
 
     def __init__(self, sink: "Sink", msg_type: type, topic: str, qos: QoSProfile) -> None:
         self.msg_type, self.topic, self.qos = msg_type, topic, qos
+        self.subscription: Subscription
         self.reader = ""  # its gid
         self.in_session = False  # whether it reads as in one
         self.lost = self.unexpected = self.missed = 0  # missed: sent before we joined
@@ -95,12 +98,13 @@ class Input:
     def listen(self, in_session: bool) -> None:
         """Subscribe anew."""
         node, qos = self._sink.node, session_qos() if in_session else self.qos
+        callback: Any = self._on_data  # rclpy counts its arguments; its types know of one
         self.in_session = in_session
         if self.reader:
             node.destroy_subscription(self.subscription)
         self.subscription, self.reader = made(
             node.get_subscriptions_info_by_topic, self.topic,
-            lambda: node.create_subscription(self.msg_type, self.topic, self._on_data, qos,
+            lambda: node.create_subscription(self.msg_type, self.topic, callback, qos,
                                              raw=True, callback_group=self._sink.gate),
             self._sink.participant)
 
@@ -150,8 +154,8 @@ class Sink:
 
     def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
                  hold: Callable[[], bool], gate: Callable[[], bool],
-                 may_answer: Callable[[], bool],
-                 on_begin: Callable[[Session], None], on_join: Callable[[], None], say: Callable[[], None],
+                 may_answer: Callable[[], bool], on_begin: Callable[[Session], None],
+                 on_join: Callable[[], None], say: Callable[[], None],
                  problem: Callable[[str], None]) -> None:
         self.node, self.participant = node, participant
         self.inputs: dict[str, Input] = {}

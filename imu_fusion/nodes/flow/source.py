@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection
 
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
 from imu_fusion.nodes.flow.peers import Peers
@@ -31,6 +32,7 @@ class Output:
         self.topic = source.node.resolve_topic_name(name)
         self.waiting: deque = deque()
         self._source = source
+        self._publisher: Publisher
         self.writer = ""  # its gid
         self.renew(qos)
 
