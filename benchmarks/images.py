@@ -19,10 +19,10 @@ from imu_fusion.evaluation.orientation_error import moving_at, orientation_error
 from imu_fusion.messages.convert import attitude_log
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.report.contents import moving_changes
 from imu_fusion.report.figures import time_figure
 from imu_fusion.report.html import Figure
 from imu_fusion.report.orientation import angle_panels, error_panels
-from imu_fusion.report.contents import moving_changes
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / "bags" / "broad_06_fast_rotation"

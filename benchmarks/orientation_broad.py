@@ -198,7 +198,7 @@ def main(only_ours=False):
     grid = list(itertools.product((1.5, 3.0, 5.0), (9.0, 25.0, 70.0)))
     for name, run in [("VQF", vqf), ("OfflineVQF", offline_vqf)]:
         add(name, "leave one out", *(leave_one_out(np.array(
-            [score(lambda i, m, s=s: run(i, m, *s), d) for s in grid])) for d in (0, 1)))
+            [score(lambda i, m, s=s, run=run: run(i, m, *s), d) for s in grid])) for d in (0, 1)))
 
 
 if __name__ == "__main__":

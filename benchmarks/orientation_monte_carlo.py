@@ -64,7 +64,8 @@ def as_stated(seed, rate=100.0, duration=30.0):
         local = keep * local + f.local_field_sd * math.sqrt(1 - keep ** 2) * rng.normal(size=3)
         row += local
     turn = Rotation.from_quat(motion.truth(mag.stamp * 1e-9)[0])
-    return imu, MagLog(mag.stamp, mag.mag + norm * turn.inv().apply(disturbance)), truth, declination
+    disturbed = MagLog(mag.stamp, mag.mag + norm * turn.inv().apply(disturbance))
+    return imu, disturbed, truth, declination
 
 
 def main():

@@ -45,7 +45,7 @@ def best_times(runs, rounds=7):
 
 
 def starts(method):
-    """Processor seconds to the first result in a fresh interpreter, with an empty and a filled cache."""
+    """Processor seconds to the first result in a fresh interpreter: empty cache, filled cache."""
     with tempfile.TemporaryDirectory() as cache:
         environment = dict(os.environ, NUMBA_CACHE_DIR=cache)
         return [float(subprocess.run([sys.executable, "-c", _START.format(method)], check=True,

@@ -66,9 +66,10 @@ def main():
     write_table("orientation_vehicles", [
         "recording", "sd of the reference, deg", "estimator", "tilt RMS, deg", "largest",
         "stated RMS", "within 3 sigma"], rows,
-        note="A vehicle keeps its accelerations longer than a hand. By default the errors are smaller "
-             "than the peers', but the covariance knows little of them; told what a vehicle is like, "
-             "it does. The preset's magnetometer errors were chosen on this aeroplane.")
+        note="A vehicle keeps its accelerations longer than a hand. By default the errors are "
+             "smaller than the peers', but the covariance knows little of them; told what a "
+             "vehicle is like, it does. The preset's magnetometer errors were chosen on this "
+             "aeroplane.")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from rich.table import Table
 
 import imu_fusion
 from imu_fusion.demos import DEMOS
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.errors import ImuFusionError, ParameterError
 from imu_fusion.nodes import NODES
 
 PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True}
@@ -320,6 +320,39 @@ def demo(name: str, out: str) -> None:
     """Play a recording through the nodes, record, compare with the truth, report."""
     from imu_fusion.demos import run_demo
     run_demo(name, out, console)
+
+
+@cli.command()
+@click.argument("file", type=click.Path())
+@click.option("--out", type=click.Path(), help="Parameter file to write; it must not exist.")
+def translate(file: str, out: str | None) -> None:
+    """Turn FILE, a parameter file of imu_tools, into one of ours.
+
+    Prints it, or writes it to --out. What has no counterpart here is listed with the reason, and so
+    are names that are not imu_tools' own: then the exit code is 1.
+    """
+    from imu_fusion.parameters.file import dump, parameters_for
+    from imu_fusion.parameters.imu_tools import translate as translated
+    from imu_fusion.streams.registry import STAGES
+    result = translated(file)
+    text = dump("orientation_estimator", result.values)
+    for line in result.left_out:
+        click.echo(f"no counterpart: {line}", err=True)
+    for name in result.unknown:
+        click.echo(f"unknown to imu_tools: {name}", err=True)
+    if out is None:
+        click.echo(text, nl=False)
+    else:
+        try:
+            with open(out, "x") as stream:
+                stream.write(text)
+        except OSError as error:
+            raise ParameterError(f"{out}: cannot be written ({error.strerror})") from None
+        stage = STAGES["orientation_estimator"]
+        parameters_for(stage.params + stage.node_params, stage.node, out)
+        click.echo(f"written: {out}", err=True)
+    if result.unknown:
+        sys.exit(1)
 
 
 @cli.command()

@@ -52,7 +52,8 @@ def entry_point(kernel: Callable, *arguments: object) -> Callable:
     A call of a kernel looks its arguments' types up, which costs 3 us where some are structured
     arrays; a call of what this returns does not. It takes arguments of just these types.
     """
-    return kernel.compile(tuple(numba.typeof(argument) for argument in arguments))
+    return kernel.compile(  # type: ignore[attr-defined]
+        tuple(numba.typeof(argument) for argument in arguments))
 
 
 @contextmanager

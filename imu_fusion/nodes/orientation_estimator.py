@@ -67,8 +67,7 @@ class OrientationEstimatorNode(EstimatorNode):
                                       self.get_logger().warning), OUTPUTS)
         for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
                              ("calibrate_magnetometer", self._calibrate)):
-            self.create_service(Trigger, f"~/{name}",
-                                lambda _, response, action=action: self._answer(response, action))
+            self.create_service(Trigger, f"~/{name}", self._answering(action))
 
     def publish(self, made):
         super().publish(made)
@@ -102,12 +101,15 @@ class OrientationEstimatorNode(EstimatorNode):
                 "now on")
 
     @staticmethod
-    def _answer(response, action):
-        try:
-            response.message, response.success = action(), True
-        except ImuFusionError as error:
-            response.message, response.success = str(error), False
-        return response
+    def _answering(action):
+        """A service callback: the answer is what ``action()`` says, or the reason why not."""
+        def answer(_, response):
+            try:
+                response.message, response.success = action(), True
+            except ImuFusionError as error:
+                response.message, response.success = str(error), False
+            return response
+        return answer
 
 
 def main(args=None):

@@ -17,6 +17,12 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor("tag:yaml.org,2002:python/tuple", yaml.SafeLoader.construct_sequence)
 
 
+def dump(node: str, values: dict[str, Any]) -> str:
+    """The text of a parameter file that gives a node these values, by dotted name."""
+    return yaml.safe_dump({node: {"ros__parameters": values}}, sort_keys=False,
+                          default_flow_style=None)
+
+
 def load(path: str | Path) -> dict[str, dict[str, Any]]:
     """Read a parameter file.
 

@@ -165,11 +165,15 @@ class BagWriter:
         """
         if self._stream.closed:
             return
+        information = self._information()
         try:
+            # As rosbag2 does: the file alone tells what the directory would.
+            self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.dump(
+                information, Dumper=_Dumper, sort_keys=False)})
             self._writer.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
-            self._write_metadata()
+            self._write_metadata(information)
         except OSError as error:
             raise BagError(f"{self.directory}: closing failed ({error.strerror}); complete "
                            "chunks stay readable") from error
@@ -182,13 +186,14 @@ class BagWriter:
         with contextlib.suppress(OSError):
             self._stream.close()
 
-    def _write_metadata(self):
+    def _information(self):
+        """What rosbag2 calls the bag's metadata."""
         first = 0 if self._first is None else self._first
         duration = 0 if self._last is None else self._last - first
         total = sum(self.counts.values())
         times = {"starting_time": {"nanoseconds_since_epoch": first},
                  "duration": {"nanoseconds": duration}, "message_count": total}
-        information = {
+        return {
             "version": 9, "storage_identifier": "mcap", **times,
             "relative_file_paths": [self._file],
             "topics_with_message_count": [
@@ -197,6 +202,8 @@ class BagWriter:
             "compression_format": "", "compression_mode": "",
             "files": [{"path": self._file, **times}],
             "custom_data": None, "ros_distro": "jazzy"}
+
+    def _write_metadata(self, information):
         # Under another name first: a metadata.yaml that exists is complete.
         temporary = self.directory / "metadata.yaml.part"
         temporary.write_text(yaml.dump({"rosbag2_bagfile_information": information},

@@ -3,7 +3,7 @@
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
 
-_UNLIMITED = {"sec": 2147483647, "nsec": 4294967295}
+_UNLIMITED = {"sec": 9223372036, "nsec": 854775807}   # RMW_DURATION_INFINITE
 
 
 def qos_profile(depth: int = 10, reliability: str = RELIABLE, durability: str = "volatile",

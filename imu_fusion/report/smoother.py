@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.smoother.inputs import valid_fixes
+from imu_fusion.estimation.smoother.measurements.gnss_fix import valid_fixes
+from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.estimation.smoother.state import BLOCKS
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
@@ -20,22 +22,8 @@ from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
 _ENU, _XYZ = ("east", "north", "up"), ("x", "y", "z")
-_INNOVATIONS = {"fix": ("position", _ENU), "velocity": ("velocity", _ENU),
-                "mag": ("magnetic field", _XYZ)}
-# Optional states: title, unit, factor to that unit, names of the components.
-_STATES = {
-    "mag_bias": ("magnetometer bias", "µT", 1e6, _XYZ),
-    "mag_scale": ("magnetometer scale", "%", 100.0, _XYZ),
-    "gnss_position_error": ("GNSS position error", "m", 1.0, _ENU),
-    "gnss_velocity_error": ("GNSS velocity error", "m/s", 1.0, _ENU),
-    "gnss_time_offset": ("delay of the GNSS", "ms", 1e3, ("delay",)),
-    "velocity_time_offset": ("further delay of velocities", "ms", 1e3, ("delay",)),
-    "acc_matrix": ("accelerometer matrix", "%", 100.0, tuple(a + b for a in "xyz" for b in "xyz")),
-    "gyr_scale": ("gyroscope scale", "%", 100.0, _XYZ),
-    "gnss_lever_arm": ("antenna in the imu frame", "m", 1.0, _XYZ),
-    "body_height": ("height above the surface", "m", 1.0, ("height",)),
-    "surface_lever_arm": ("point on the surface in the imu frame", "m", 1.0, _XYZ),
-}
+_MEASUREMENTS = {m.name: m for m in MEASUREMENTS}
+_STATES = {block.name: block for block in BLOCKS}
 _BOUND, _IDEAL = 1.96, 95.0  # of a standard normal distribution, and its share within, %
 
 
@@ -170,8 +158,8 @@ def _flight(smoothed):
     events = smoothed.result.events
     if events is None:
         return ()
-    span = tuple(float(seconds(s, smoothed.origin)) for s in (events.takeoff, events.touchdown))
-    return (Shade("in the air", (span,)),)
+    start, stop = seconds(np.array([events.takeoff, events.touchdown]), smoothed.origin).tolist()
+    return (Shade("in the air", ((start, stop),)),)
 
 
 def _figure(smoothed, panels, caption="", **options):
@@ -266,7 +254,8 @@ def _errors(smoothed):
                                   scale * samples[f"{name}_bias_sd"], what, unit, _XYZ))
     rows = []
     for name, (values, sd) in smoothed.result.states.items():
-        what, unit, scale, names = _STATES[name]
+        block = _STATES[name]
+        what, unit, scale, names = block.title, block.unit, block.factor, block.components
         # Constant states wander by rounding only.
         if (np.ptp(values, axis=0) > 1e-6 * sd.max(axis=0)).any():
             panels.append(_components(time, scale * values, scale * sd, what, unit, names))
@@ -281,7 +270,7 @@ def _errors(smoothed):
 
 
 def _components(time, values, sd, what, unit, names):
-    items = []
+    items: list[Band | Line] = []
     for i, (part, color) in enumerate(zip(names, fig.SERIES if len(names) > 3 else
                                           fig.AXES.values())):
         items.append(Band(f"±3σ {part}", time, values[:, i] - 3 * sd[:, i],
@@ -317,7 +306,7 @@ def _innovations(smoothed):
     """Normalised innovations with their bounds, and whether they are white."""
     rows, panels = [], []
     for name, (stamp, values) in smoothed.result.innovations.items():
-        what, parts = _INNOVATIONS[name]
+        what, parts = _MEASUREMENTS[name].title, _MEASUREMENTS[name].components
         time = seconds(stamp, smoothed.origin)
         for i, part in enumerate(parts):
             v = values[:, i]

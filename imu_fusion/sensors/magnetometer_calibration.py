@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from imu_fusion.errors import CalibrationError
@@ -45,7 +46,7 @@ class MagCalibration:
     condition: float
     samples: int
 
-    def apply(self, mag):
+    def apply(self, mag: ArrayLike) -> np.ndarray:
         """Calibrated field, (..., 3) tesla."""
         return (np.asarray(mag) - self.offset) @ self.matrix.T
 
@@ -53,8 +54,8 @@ class MagCalibration:
         """``sensor.mag_offset``, ``sensor.mag_matrix`` and ``fusion.mag_offset_sd`` as
         OrientationParams and YAML take them.
 
-        ``fusion.mag_matrix_sd`` is not among them: an ellipsoid does not show how the magnetometer's
-        axes are turned against those of the Imu.
+        ``fusion.mag_matrix_sd`` is not among them: an ellipsoid does not show how the
+        magnetometer's axes are turned against those of the Imu.
         """
         offset_sd = math.sqrt(np.trace(self.cov[:3, :3]) / 3.0) / self.field_norm
         return {"sensor.mag_offset": [float(v) for v in self.offset],
@@ -62,7 +63,7 @@ class MagCalibration:
                 "fusion.mag_offset_sd": min(float(offset_sd), 1.0)}
 
 
-def coverage(directions):
+def coverage(directions: ArrayLike) -> float:
     """Share of the cells of a cube around the origin that unit vectors (n, 3) hit."""
     d = np.asarray(directions)
     axis = np.argmax(np.abs(d), axis=1)
@@ -103,7 +104,26 @@ def _algebraic(m):
         "directions, away from iron, and check that the samples are in tesla")
 
 
-def calibrate_magnetometer(mag, field_norm=None):
+def _fit(m, estimate, radius):
+    """Geometric fit of offset and upper triangle (9,), begun at ``estimate``, to m (n, 3).
+
+    A robust fit finds what is disturbed, a plain one of the rest gives the covariance. Returns the
+    last scipy result, and the samples (k, 3) that it is of.
+    """
+    def residual(p, m):
+        return np.linalg.norm((m - p[:3]) @ _symmetric(p[3:]), axis=1) - radius
+
+    for loss in ("soft_l1", "soft_l1", "linear"):
+        errors = residual(estimate, m)
+        scatter = max(float(np.median(np.abs(errors))) / 0.6745, 1e-12)
+        kept = m if loss == "soft_l1" else m[np.abs(errors) < 5.0 * scatter]
+        fit = least_squares(residual, estimate, args=(kept,), loss=loss, f_scale=scatter,
+                            x_scale="jac", xtol=1e-12, ftol=1e-12)
+        estimate = fit.x
+    return fit, kept
+
+
+def calibrate_magnetometer(mag: np.ndarray, field_norm: float | None = None) -> MagCalibration:
     """Fit an ellipsoid to magnetometer samples taken while the sensor turned.
 
     Args:
@@ -129,18 +149,8 @@ def calibrate_magnetometer(mag, field_norm=None):
     centre, root = _algebraic(m)
     radius = np.linalg.det(root) ** (-1.0 / 3.0)     # geometric mean of the semi-axes
 
-    def residual(p, m):
-        return np.linalg.norm((m - p[:3]) @ _symmetric(p[3:]), axis=1) - radius
-
-    # A robust fit finds what is disturbed, a plain one of the rest gives the covariance.
-    estimate = np.concatenate([centre, (root * radius)[_UPPER]])
-    for loss in ("soft_l1", "soft_l1", "linear"):
-        errors = residual(estimate, m)
-        scatter = max(float(np.median(np.abs(errors))) / 0.6745, 1e-12)
-        kept = m if loss == "soft_l1" else m[np.abs(errors) < 5.0 * scatter]
-        fit = least_squares(residual, estimate, args=(kept,), loss=loss, f_scale=scatter,
-                            x_scale="jac", xtol=1e-12, ftol=1e-12)
-        estimate = fit.x
+    fit, kept = _fit(m, np.concatenate([centre, (root * radius)[_UPPER]]), radius)
+    estimate = fit.x
     jacobian = fit.jac
     scale = np.linalg.norm(jacobian, axis=0)
     singular = np.linalg.svd(jacobian / np.maximum(scale, 1e-300), compute_uv=False)
@@ -177,13 +187,13 @@ class MagCalibrator:
     stays balanced and bounded.
     """
 
-    def __init__(self, field_norm=None):
+    def __init__(self, field_norm: float | None = None) -> None:
         self._field_norm = field_norm
         self._kept = np.empty((_CAPACITY, 3))
         self._count = 0
         self._norm = 0.0
 
-    def add(self, mag):
+    def add(self, mag: ArrayLike) -> bool:
         """Offer one sample (3,) tesla. Returns whether it was kept."""
         mag = np.asarray(mag, dtype=float)
         if not np.isfinite(mag).all() or self._count == _CAPACITY:
@@ -196,6 +206,6 @@ class MagCalibrator:
         self._count += 1
         return True
 
-    def result(self):
+    def result(self) -> MagCalibration:
         """MagCalibration of what was kept so far. Raises CalibrationError as the batch fit."""
         return calibrate_magnetometer(self._kept[:self._count], self._field_norm)

@@ -6,6 +6,7 @@ orientation estimator's own saturation states (method ``fusion``).
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_fusion.errors import SampleError
 
@@ -13,12 +14,13 @@ from imu_fusion.errors import SampleError
 LIMIT_TOLERANCE = 1.5e-4
 
 
-def saturated_axes(gyr, limit):
+def saturated_axes(gyr: np.ndarray, limit: ArrayLike) -> np.ndarray:
     """Mask (n, 3) of rates gyr (n, 3) rad/s at their limit, scalar or (3,) rad/s."""
-    return np.abs(gyr) >= np.asarray(limit, dtype=float) * (1.0 - LIMIT_TOLERANCE)
+    return np.asarray(np.abs(gyr) >= np.asarray(limit, dtype=float) * (1.0 - LIMIT_TOLERANCE))
 
 
-def recover_rates(stamp, gyr, mag, limit):
+def recover_rates(stamp: np.ndarray, gyr: np.ndarray, mag: np.ndarray,
+                  limit: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Missing rates from the change of the field in imu axes.
 
     The normalised field b obeys ``db/dt = b x omega`` (B.3, with [b]x and not its
@@ -55,4 +57,4 @@ def recover_rates(stamp, gyr, mag, limit):
         rows = np.vstack([[[0, -z, y], [z, 0, -x], [-y, x, 0]], np.eye(3)[~missing[i]]])
         rates[i] = np.linalg.lstsq(rows, np.concatenate([change[i], gyr[i][~missing[i]]]),
                                    rcond=None)[0]
-    return rates, lost
+    return rates, np.asarray(lost)

@@ -1,7 +1,8 @@
 """What the smoother asks of a surface: rows ``0 = residual(position) + noise``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -31,9 +32,9 @@ class Constraint:
     phase: str
     sigma: float
     height: bool
-    evaluate: Callable
+    evaluate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.phase not in PHASES:
             raise LayoutError(f"constraint {self.name}: phase {self.phase!r}, known {PHASES}")
         if not 0 < self.sigma < np.inf:
@@ -47,12 +48,12 @@ class Surface:
 
     origin: LocalFrame
 
-    def constraints(self):
+    def constraints(self) -> tuple[Constraint, ...]:
         """A tuple of :class:`Constraint`."""
         raise NotImplementedError
 
 
-def split_sigma(sigma, parts):
+def split_sigma(sigma: Any, parts: Sequence[str]) -> dict[str, float]:
     """Standard deviation (m) of each part, from one number for all or a mapping of some of
     them; the others have :data:`DEFAULT_SIGMA`.
 
@@ -75,7 +76,7 @@ def _positive(sigma, name):
     return sigma
 
 
-def height_constraint(name, phase, sigma, elevation):
+def height_constraint(name: str, phase: str, sigma: float, elevation: Callable) -> Constraint:
     """Constraint of the height above ``elevation(east, north) -> z, dz/de, dz/dn``."""
     def evaluate(position_world):
         z, de, dn = elevation(position_world[:, 0], position_world[:, 1])

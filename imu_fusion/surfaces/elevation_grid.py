@@ -112,7 +112,7 @@ class ElevationGrid(Surface):
     height_offset: float = 0.0
     sigma: float | dict = DEFAULT_SIGMA
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         number(self.height_offset, "height_offset", "m", -1000.0, 1000.0)
         split_sigma(self.sigma, PARTS)
         self._check_origin()
@@ -194,6 +194,6 @@ class ElevationGrid(Surface):
         gradient = np.column_stack([-slope, np.ones(len(z))])
         return np.where(bad, np.nan, height - z), gradient
 
-    def constraints(self):
+    def constraints(self) -> tuple[Constraint, ...]:
         sigma = split_sigma(self.sigma, PARTS)["elevation_grid"]
         return (Constraint("elevation_grid", "always", sigma, True, self._evaluate),)

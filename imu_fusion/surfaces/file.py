@@ -9,12 +9,13 @@
 import reprlib
 import sys
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from imu_fusion.errors import ImuFusionError, LayoutError
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.surfaces.constraint import DEFAULT_SIGMA
+from imu_fusion.surfaces.constraint import DEFAULT_SIGMA, Surface
 from imu_fusion.surfaces.elevation_grid import ElevationGrid
 from imu_fusion.surfaces.fis_hill import FisHill
 from imu_fusion.surfaces.hill import Hill
@@ -45,7 +46,8 @@ def _hill_table(values, origin, sigma, folder):
     in_run, landing = _take(values, "in_run"), _take(values, "landing")
     n, w = values.pop("n", None), values.pop("w", None)
     _refuse_rest(values)
-    return Hill(origin, azimuth, *table_hill(in_run, landing, n, w), sigma)
+    in_run, landing, k_point = table_hill(in_run, landing, n, w)
+    return Hill(origin, azimuth, in_run, landing, k_point, sigma)
 
 
 def _plane(values, origin, sigma, folder):
@@ -110,7 +112,7 @@ def _origin(place):
     return LocalFrame(latitude, longitude, height)
 
 
-def surface_from_mapping(mapping, folder="."):
+def surface_from_mapping(mapping: Any, folder: str | Path = ".") -> Surface:
     """The surface that a mapping describes (docs/surfaces.md).
 
     Args:
@@ -133,7 +135,7 @@ def surface_from_mapping(mapping, folder="."):
         raise LayoutError(f"{kind}: {error}") from error
 
 
-def load_surface(name):
+def load_surface(name: str | Path) -> Surface:
     """The surface of a YAML file: a path, or the name of one in config/surfaces.
 
     Raises:

@@ -14,7 +14,7 @@ import numpy as np
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.surfaces.profile import (Arc, Line, Polynomial, Profile, TiltedCubic,
+from imu_fusion.surfaces.profile import (Arc, Curve, Line, Polynomial, Profile, TiltedCubic,
                                          TiltedParabola)
 
 #: The norm's w by the chord from the table edge to K, and what certificates may miss it by:
@@ -65,7 +65,7 @@ class FisHill(Parameters):
     out_run_curve: str = param("parabola", doc="Curve between L and the out-run",
                                choices=("parabola", "circle"))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         self._check_figures()
         self._check_profiles()
@@ -130,7 +130,7 @@ class FisHill(Parameters):
         d = 2.0 * self.r1 * np.sin(delta) * np.cos(delta) ** 2
         return d * (1.0 + 0.1 * np.tan(delta) ** 2)
 
-    def in_run(self):
+    def in_run(self) -> tuple[Profile, dict[str, np.ndarray]]:
         """Profile of the in-run (straight, transition, table), and its points E1, E2, A and,
         where es is given, B."""
         gamma, alpha = np.radians([self.gamma_deg, self.alpha_deg])
@@ -142,10 +142,10 @@ class FisHill(Parameters):
             d = 2.0 * self.r1 * np.sin(delta) * np.cos(delta) ** 2
             c = np.tan(delta) / (3.0 * d * d)
             e1 = e2 - d * down - c * d ** 3 * np.array([np.sin(gamma), -np.cos(gamma)])
-            curve = TiltedCubic(e1[0], e1[1], gamma, c)
+            curve: Curve = TiltedCubic(e1[0], e1[1], gamma, c)
         else:
-            curve = Arc(e2[0], e2[1], alpha, self.r1)
-            e1 = np.array(curve.at_angle(gamma))
+            arc = Arc(e2[0], e2[1], alpha, self.r1)
+            e1, curve = np.array(arc.at_angle(gamma)), arc
         profile = Profile([e1[0], e2[0]], [Line(e1[0], e1[1], np.tan(gamma)), curve,
                                            Line(0.0, 0.0, np.tan(alpha))])
         a = e1 - (self.e - self._transition_length()) * down
@@ -154,7 +154,7 @@ class FisHill(Parameters):
             points["B"] = a + self.es * down
         return profile, points
 
-    def gate(self, number):
+    def gate(self, number: int) -> np.ndarray:
         """Point (2,) of a start gate; gate 1 is the lowest, B, gate ``gates`` the highest, A."""
         if self.es is None or self.gates is None:
             raise LayoutError("hill: start gates need es and gates of the certificate")
@@ -164,7 +164,7 @@ class FisHill(Parameters):
         share = (number - 1) / max(self.gates - 1, 1)
         return points["B"] + share * (points["A"] - points["B"])
 
-    def landing(self):
+    def landing(self) -> tuple[Profile, dict[str, np.ndarray]]:
         """Profile of the landing side (knoll, landing area, transition, out-run), and its
         points P, K, L, U."""
         beta_p, beta_k, beta_l = np.radians([self.betaP_deg, self.beta_deg, self.betaL_deg])
@@ -179,17 +179,18 @@ class FisHill(Parameters):
         v = xp * (np.tan(beta_p) - np.tan(beta_0))
         knoll = Polynomial(0.0, (self.s, np.tan(beta_0), (3.0 * u - v) / xp ** 2,
                                  (v - 2.0 * u) / xp ** 3))
-        if self.out_run_curve == "parabola":
+        if self.out_run_curve == "parabola" and self.r2L is not None:
             ratio = np.cbrt(self.r2 / self.r2L)
             tilt = np.arctan((np.cos(beta_l) - ratio) / np.sin(beta_l))
             c = 1.0 / (2.0 * self.r2 * np.cos(tilt) ** 3)
             xi_l, xi_u = -np.tan(beta_l + tilt) / (2.0 * c), -np.tan(tilt) / (2.0 * c)
-            curve = TiltedParabola(xl, zl, tilt, c, xi_l)
-            (right_l, up_l), (right_u, up_u) = curve.offset(xi_l), curve.offset(xi_u)
+            parabola = TiltedParabola(xl, zl, tilt, c, xi_l)
+            (right_l, up_l), (right_u, up_u) = parabola.offset(xi_l), parabola.offset(xi_u)
+            curve: Curve = parabola
             xu, zu = xl + right_u - right_l, zl - (up_u - up_l)
         else:
-            curve = Arc(xl, zl, beta_l, self.r2)
-            xu, zu = curve.at_angle(0.0)
+            circle = Arc(xl, zl, beta_l, self.r2)
+            (xu, zu), curve = circle.at_angle(0.0), circle
         profile = Profile([0.0, xp, xl, xu], [Line(0.0, self.s, np.tan(beta_0)), knoll, arc,
                                               curve, Line(xu, zu, 0.0)])
         return profile, {"P": np.array([xp, zp]), "K": np.array([self.n, self.h]),

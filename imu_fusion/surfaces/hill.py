@@ -25,27 +25,27 @@ class Hill(Surface):
     azimuth_deg: float
     in_run: Profile
     landing: Profile
-    k_point: tuple
+    k_point: tuple[float, float]
     sigma: float | dict = DEFAULT_SIGMA
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         number(self.azimuth_deg, "azimuth_deg", "deg", -360.0, 360.0)
         split_sigma(self.sigma, PARTS)
 
     @property
-    def axes(self):
+    def axes(self) -> np.ndarray:
         """R_hill_world (3, 3)."""
         return hill_axes(self.azimuth_deg)
 
-    def to_hill(self, vector_world):
+    def to_hill(self, vector_world: np.ndarray) -> np.ndarray:
         """Positions or vectors (..., 3) in the hill frame: x forward, y right, z down."""
         return np.asarray(vector_world) @ self.axes.T
 
-    def to_world(self, vector_hill):
+    def to_world(self, vector_hill: np.ndarray) -> np.ndarray:
         """The inverse of :meth:`to_hill`."""
         return np.asarray(vector_hill) @ self.axes
 
-    def jump_length(self, x):
+    def jump_length(self, x: float) -> float:
         """Length of a jump that lands at x (scalar, m), along the profile as the markers lie."""
         x_k, w = self.k_point
         return w + self.landing.arc_length(x_k, float(x))
@@ -64,7 +64,7 @@ class Hill(Surface):
         axis = self.axes[1]
         return position_world @ axis, np.broadcast_to(axis, position_world.shape)
 
-    def constraints(self):
+    def constraints(self) -> tuple[Constraint, ...]:
         sigma = split_sigma(self.sigma, PARTS)
         return (Constraint("in_run", "in_run", sigma["in_run"], True,
                            self._vertical(self.in_run)),

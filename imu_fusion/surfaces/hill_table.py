@@ -1,10 +1,12 @@
 """A hill from surveyed points (x, z): what a survey in the right frame must look like."""
 
+from typing import Any
+
 import numpy as np
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.surfaces.fis_hill import W_BY_CHORD
-from imu_fusion.surfaces.profile import table_points, table_profile
+from imu_fusion.surfaces.profile import Profile, table_points, table_profile
 from imu_fusion.surfaces.values import number
 
 EDGE_TOLERANCE = 0.1  # m, of the table edge: the origin is measured there
@@ -13,7 +15,8 @@ STEEPEST_DEG = 60.0  # as for certificates; real hills stay below 40
 W_TOLERANCE = 0.03  # of w: older norms measured it otherwise
 
 
-def table_hill(in_run, landing, n=None, w=None):
+def table_hill(in_run: Any, landing: Any, n: Any = None, w: Any = None
+               ) -> tuple[Profile, Profile, tuple[float, float]]:
     """Profiles of in-run and landing side, and (n, w) of the K point; without one, (0, 0):
     lengths count along the profile from the foot of the table.
 

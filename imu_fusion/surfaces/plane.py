@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import LayoutError
-from imu_fusion.surfaces.constraint import (DEFAULT_SIGMA, Surface, height_constraint,
-                                            split_sigma)
+from imu_fusion.surfaces.constraint import (DEFAULT_SIGMA, Constraint, Surface,
+                                            height_constraint, split_sigma)
 from imu_fusion.surfaces.values import number
 
 PARTS = ("plane",)
@@ -25,13 +25,13 @@ class Plane(Surface):
     aspect_deg: float = 0.0
     sigma: float | dict = DEFAULT_SIGMA
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if number(self.slope_deg, "slope_deg", "deg", 0.0, 90.0) == 90.0:
             raise LayoutError("key 'slope_deg': a plane of 90 deg has no height above it")
         number(self.aspect_deg, "aspect_deg", "deg", -360.0, 360.0)
         split_sigma(self.sigma, PARTS)
 
-    def constraints(self):
+    def constraints(self) -> tuple[Constraint, ...]:
         aspect = np.radians(self.aspect_deg)
         fall = np.tan(np.radians(self.slope_deg))
         de, dn = -fall * np.sin(aspect), -fall * np.cos(aspect)

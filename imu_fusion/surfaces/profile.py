@@ -1,7 +1,9 @@
 """Curves z(x) of a hill's long section: x horizontal forward, z down, metres."""
 
 import reprlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.integrate import quad
@@ -14,6 +16,10 @@ from imu_fusion.surfaces.values import number
 _HEIGHT_TOLERANCE = 1e-6  # m
 _SLOPE_TOLERANCE_DEG = 1e-4
 _RADIUS_TOLERANCE = 1e-6  # of the radius; of a straight piece: 1 / m
+
+#: x (any shape) -> z, dz/dx, d2z/dx2.
+Curve = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
 
 @dataclass(frozen=True)
 class Line:
@@ -53,7 +59,7 @@ class Polynomial:
     """Ascending coefficients in x - x0."""
 
     x0: float
-    coefficients: tuple
+    coefficients: tuple[float, ...]
 
     def __call__(self, x):
         p = np.polynomial.Polynomial(self.coefficients)
@@ -112,14 +118,14 @@ class TiltedParabola:
 class Profile:
     """A curve in pieces: ``pieces[i]`` holds between ``knots[i - 1]`` and ``knots[i]``."""
 
-    def __init__(self, knots, pieces):
+    def __init__(self, knots: Sequence[float], pieces: Sequence[Curve]):
         self.knots = np.asarray(knots, dtype=float)
         self.pieces = tuple(pieces)
         if len(self.pieces) != len(self.knots) + 1 or np.any(np.diff(self.knots) <= 0):
             raise LayoutError(f"profile: joints must increase, are {self.knots.round(3).tolist()}")
 
     def __call__(self, x):
-        """z, dz/dx and d2z/dx2 at x (any shape)."""
+        """z, dz/dx and d2z/dx2 at x (any shape): (3, ...)."""
         x = np.asarray(x, dtype=float)
         piece = np.searchsorted(self.knots, x)
         result = np.empty((3, *x.shape))
@@ -128,7 +134,8 @@ class Profile:
             result[:, here] = self.pieces[i](x[here])
         return result
 
-    def check_joints(self, names, radii):
+    def check_joints(self, names: Sequence[str],
+                     radii: Mapping[str, tuple[float | None, float | None]]) -> None:
         """Refuse a joint at which height or slope jumps or a radius is not the stated one.
 
         Args:
@@ -160,14 +167,14 @@ class Profile:
                     raise LayoutError(f"joint {name} (x = {x:.3f} m): curvature {side} it is "
                                       f"{curvature:.8f} 1/m, the stated radius is {radius:g} m")
 
-    def arc_length(self, x0, x1):
+    def arc_length(self, x0: float, x1: float) -> float:
         """Signed length of the curve from x0 to x1, m."""
         joints = self.knots[(self.knots > min(x0, x1)) & (self.knots < max(x0, x1))]
         return quad(lambda x: float(np.hypot(1.0, self(x)[1])), x0, x1,
                     points=joints if len(joints) else None, limit=200)[0]
 
 
-def table_points(points, where):
+def table_points(points: Any, where: str) -> np.ndarray:
     """Surveyed points as an array (n, 2) of increasing x.
 
     Args:
@@ -194,7 +201,7 @@ def table_points(points, where):
     return table
 
 
-def table_profile(points, where):
+def table_profile(points: Any, where: str) -> Profile:
     """Profile through surveyed points (n, 2) of increasing x: monotone cubics (PCHIP), whose
     slope is continuous and does not overshoot; straight beyond both ends.
 

@@ -3,11 +3,13 @@
 import math
 import numbers
 import reprlib
+from typing import Any
 
 from imu_fusion.errors import LayoutError
 
 
-def number(value, name, unit, low=-math.inf, high=math.inf):
+def number(value: Any, name: str, unit: str, low: float = -math.inf, high: float = math.inf
+           ) -> float:
     """``value`` as a finite float within ``low`` to ``high`` (inclusive).
 
     Text that reads as a number is one: to YAML 1.1, ``1e-1`` without a point is text.

@@ -155,7 +155,7 @@ def test_live_answers_every_imu_without_waiting_for_the_magnetometer(graph, reco
     node.create_publisher(MagneticField, "/imu/mag", 1000)  # says nothing
     graph.start(OrientationEstimatorNode)
     heard = []
-    node.create_subscription(Imu, "/imu/data", lambda m: heard.append(m), 1000)
+    node.create_subscription(Imu, "/imu/data", heard.append, 1000)
     graph.until(lambda: raw.get_subscription_count() == 1)
     for i in range(500):
         raw.publish(imu_message(int(imu.stamp[i]), "ball", imu.gyr[i], imu.acc[i]))
@@ -282,7 +282,7 @@ def test_calibration_answers_as_yaml_and_is_used(graph, recording):
     node = graph.node("driver")
     raw = node.create_publisher(MagneticField, "/imu/mag", 5000)
     estimator = graph.start(OrientationEstimatorNode)
-    graph.until(lambda: raw.get_subscription_count())
+    graph.until(raw.get_subscription_count)
     for i in range(len(mag)):
         raw.publish(mag_message(int(mag.stamp[i]), "ball", mag.mag[i] + [1e-5, 0.0, -5e-6]))
     graph.until(lambda: sum(

@@ -8,6 +8,7 @@ import textwrap
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
@@ -240,3 +241,17 @@ def test_writer_refuses_what_is_in_its_way(tmp_path):
             writer.write("/b", "nobody_msgs/msg/Thing", b"", START)
         with pytest.raises(BagError, match="absolute.*'/c'"):
             writer.write("c", IMU.msgtype, imu(0), START)
+
+
+def test_the_file_itself_carries_rosbag2_s_metadata(tmp_path):
+    """As rosbag2_storage_mcap writes it: what metadata.yaml says, below its first key."""
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/imu", IMU.msgtype, imu(0), START)
+    said = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())
+    with open(tmp_path / "bag" / "bag_0.mcap", "rb") as stream:
+        (entry,) = make_reader(stream).iter_metadata()
+    assert entry.name == "rosbag2"
+    inside = yaml.safe_load(entry.metadata["serialized_metadata"])
+    assert inside == said["rosbag2_bagfile_information"] and inside["message_count"] == 1
+    qos = inside["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"][0]
+    assert qos["lifespan"] == {"sec": 2**63 // 10**9, "nsec": (2**63 - 1) % 10**9}

@@ -8,7 +8,10 @@ import pytest
 from imu_fusion.errors import CalibrationError
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.sensors.magnetometer_calibration import (
-    MagCalibrator, calibrate_magnetometer, coverage)
+    MagCalibrator,
+    calibrate_magnetometer,
+    coverage,
+)
 
 NORM = 48e-6
 OFFSET = np.array([12e-6, -25e-6, 8e-6])

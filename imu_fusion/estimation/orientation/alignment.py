@@ -9,13 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
 from imu_fusion.estimation.orientation.mag_rejection import are_saturated
 from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.estimation.orientation.state import MAG_LIMIT
 from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
+from imu_fusion.kernels import njit
 from imu_fusion.sensors.saturation import saturated_axes
 
 # Largest rate that can be a gyroscope's bias, and largest scatter of rate and specific
@@ -152,7 +152,7 @@ def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: 
         field_norm = float(np.linalg.norm(field_first))
         inclination = math.asin(np.clip(-(field_first @ up) / max(field_norm, 1e-30), -1, 1))
         has_heading = math.cos(inclination) > _HORIZONTAL_SHARE
-    if has_heading:
+    if has_heading and field_first is not None:
         r = triad(up, field_first, math.radians(params.declination_deg or 0.0))
         horizontal = field_norm * math.cos(inclination)
         heading_variance = ((p.mag_noise_sd / horizontal) ** 2 / len(mag)

@@ -6,9 +6,8 @@ starts as the slope that ran into the limit and is forgotten in its correlation 
 
 import math
 
-from imu_fusion.kernels import njit
-
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.kernels import njit
 
 
 @njit

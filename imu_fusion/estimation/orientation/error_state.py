@@ -20,6 +20,7 @@ predictions and updates can be written to a tape, which the smoother reads backw
 import math
 
 import numpy as np
+
 from imu_fusion.kernels import njit
 
 # The first index of each part; the nominal values are fields of state.STATE.
@@ -249,6 +250,21 @@ def put_single(row, index, residual, variance):
 
 
 @njit
+def _record(tape, row, spread, total, innovation):
+    """Write one update to a block's tape."""
+    which = tape.count
+    if which == MAX_UPDATES:
+        raise IndexError("more updates in a block than its tape holds: raise MAX_UPDATES")
+    tape.row[which] = row
+    gain = tape.gain[which]
+    for i in range(N):
+        gain[i] = spread[i] / total
+    tape.total[which] = total
+    tape.innovation[which] = innovation
+    tape.count = which + 1
+
+
+@njit
 def update(cov, error, states, row, tape):
     """One scalar measurement of the error state, in place.
 
@@ -275,15 +291,7 @@ def update(cov, error, states, row, tape):
         total += row.coefficient[a] * spread[row.index[a]]
         innovation -= row.coefficient[a] * error[row.index[a]]
     if len(tape):
-        t = tape[0]
-        if t.count == MAX_UPDATES:
-            raise IndexError("more updates in a block than its tape holds: raise MAX_UPDATES")
-        t.row[t.count] = row
-        for i in range(N):
-            t.gain[t.count, i] = spread[i] / total
-        t.total[t.count] = total
-        t.innovation[t.count] = innovation
-        t.count += 1
+        _record(tape[0], row, spread, total, innovation)
     for i in range(states):
         gain = spread[i] / total
         error[i] += gain * innovation

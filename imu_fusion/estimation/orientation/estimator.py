@@ -23,7 +23,7 @@ from imu_fusion.estimation.orientation.imu_rejection import are_imu_samples, is_
 from imu_fusion.estimation.orientation.mag_rejection import is_mag_sample
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_GAP, ORIENTATION_DTYPE
-from imu_fusion.estimation.orientation.state import COUNTS, new_state
+from imu_fusion.estimation.orientation.state import COUNT_NAMES, COUNTS, new_state
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_to_rpy
 from imu_fusion.samples.logs import ImuLog, MagLog
 
@@ -209,7 +209,7 @@ class OrientationEstimator:
         rows = self.finish()
         if self._alignment is not None:
             self._yaw = quat_to_rpy(self._state["quat_world_imu"][0])[2]
-        corrected = None if self._lag is None else self._lag.take()
+        corrected = self.take_corrected()
         self._counted = self._counts()
         self._counted["gaps"] += 1
         self._forget()
@@ -244,14 +244,14 @@ class OrientationEstimator:
     @property
     def mag_saturated(self) -> int:
         """How many magnetometer samples were refused with an axis at its limit."""
-        return int(self._counts()["mag_saturated"][0])
+        return int(self._state["counts"]["mag_saturated"][0] + self._counted["mag_saturated"][0])
 
     def summary(self) -> dict[str, Any]:
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
         s, par, a = self._state[0], self._par[0], self._alignment
         counts = dict(
             method=self.params.method, aligned=a is not None,
-            **{name: int(self._counts()[name][0]) for name in COUNTS.names})
+            **{name: int(value) for name, value in zip(COUNT_NAMES, self._counts()[0])})
         if a is None:
             return counts
         return counts | dict(
@@ -268,7 +268,7 @@ class OrientationEstimator:
     def _counts(self):
         """Counts of the present stretch and of those before it, (1,) COUNTS."""
         total = self._counted.copy()
-        for name in COUNTS.names:
+        for name in COUNT_NAMES:
             total[name] += self._state["counts"][name]
         return total
 

@@ -9,14 +9,19 @@ with its tape when its turn comes.
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation.kernel import CURSOR, forward
-from imu_fusion.estimation.orientation.rows import (
-    clipped_axes, raise_to_limits, write_cov_attitude)
+from imu_fusion.estimation.orientation.rows import clipped_axes, raise_to_limits, write_cov_attitude
 from imu_fusion.geometry.rotation import (
-    quat_conjugate, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix)
+    quat_conjugate,
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_to_matrix,
+)
+from imu_fusion.kernels import njit
 
 # Blocks between snapshots. A snapshot is about as large as a tape: the memory of n blocks,
 # n / 128 snapshots and 128 tapes, is smallest near sqrt(n), 2.5 s for five minutes of 20 ms blocks.

@@ -11,30 +11,45 @@ for what it does not show (clipped_rate).
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.orientation import clipped_rate
+from imu_fusion.estimation.orientation import (
+    clipped_rate,
+    gyro_limit,
+    gyro_spike,
+    imu_rejection,
+    mag_queue,
+    rotation_history,
+)
 from imu_fusion.estimation.orientation import error_state as es
-from imu_fusion.estimation.orientation import gyro_limit
-from imu_fusion.estimation.orientation import gyro_spike
-from imu_fusion.estimation.orientation import imu_rejection
-from imu_fusion.estimation.orientation import mag_queue
-from imu_fusion.estimation.orientation import rotation_history
-from imu_fusion.estimation.orientation.measurements import back_in_range
-from imu_fusion.estimation.orientation.measurements import bounded_motion
-from imu_fusion.estimation.orientation.measurements import magnetometer
-from imu_fusion.estimation.orientation.measurements import rest
+from imu_fusion.estimation.orientation.measurements import (
+    back_in_range,
+    bounded_motion,
+    magnetometer,
+    rest,
+)
 from imu_fusion.estimation.orientation.motion_scale import motion_scale
 from imu_fusion.estimation.orientation.rest_detection import is_still
 from imu_fusion.estimation.orientation.rows import (
-    FLAG_ALIGNING, FLAG_GAP, FLAG_HELD, FLAG_MAG_DISTURBED, FLAG_MAG_USED, FLAG_NO_HEADING,
-    FLAG_SATURATED, FLAG_STILL, SATURATED_AXES_SHIFT, raise_to_limits, write_attitude)
+    FLAG_ALIGNING,
+    FLAG_GAP,
+    FLAG_HELD,
+    FLAG_MAG_DISTURBED,
+    FLAG_MAG_USED,
+    FLAG_NO_HEADING,
+    FLAG_SATURATED,
+    FLAG_STILL,
+    SATURATED_AXES_SHIFT,
+    raise_to_limits,
+    write_attitude,
+)
 from imu_fusion.estimation.orientation.state import MAG_SUM
-from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_to_matrix)
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
+from imu_fusion.kernels import njit
 
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
-_BURST_SHARE = 0.1         # of the block, while an axis is at its limit: it changes by its size
+# Of the block, while an axis is at its limit: its angular acceleration is forgotten in the time of
+# two whole blocks.
+_BURST_SHARE = 0.1
 _DISTURBED = 0.5           # weight (10) below which a sample is flagged as disturbed
 _STILL_LOCAL_RATE = 1e-3   # 1/s: at rest the local field is forgotten in a quarter of an hour
 _BIAS_SD_FLOOR = 2e-4      # rad/s: a first second at rest shows no bias better than that
@@ -256,11 +271,11 @@ def _end_block(s, p, tape):
     correct(s, p, error, tape)
     _add_error(s, p, error)
     if len(tape):
-        t = tape[0]
         for i in range(es.N):
+            source, target = s.cov[i], tape[0].cov[i]    # row by row: as fast as memory
             for j in range(es.N):
-                t.cov[i, j] = s.cov[i, j]
-        t.turned = s.world_turned
+                target[j] = source[j]
+        tape[0].turned = s.world_turned
     s.world_turned = False
     s.block_start = s.stamp
     s.block = _NO_BLOCK[0]

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation.state import GYRO_LIMIT
+from imu_fusion.kernels import njit
 from imu_fusion.sensors.saturation import LIMIT_TOLERANCE
 
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top

@@ -14,19 +14,29 @@ by 2 and w, and solved together with the slow states of gyroscope and magnetomet
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.orientation import gyro_limit
-from imu_fusion.estimation.orientation import imu_rejection
-from imu_fusion.estimation.orientation import mag_queue
-from imu_fusion.estimation.orientation import rotation_history
+from imu_fusion.estimation.orientation import gyro_limit, imu_rejection, mag_queue, rotation_history
 from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
 from imu_fusion.estimation.orientation.rows import (
-    FLAG_ALIGNING, FLAG_GAP, FLAG_MAG_USED, FLAG_NO_HEADING, FLAG_SATURATED,
-    SATURATED_AXES_SHIFT, write_attitude)
+    FLAG_ALIGNING,
+    FLAG_GAP,
+    FLAG_MAG_USED,
+    FLAG_NO_HEADING,
+    FLAG_SATURATED,
+    SATURATED_AXES_SHIFT,
+    write_attitude,
+)
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_rotate_inverse,
-    quat_to_matrix, right_jacobian, skew)
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_rotate_inverse,
+    quat_to_matrix,
+    right_jacobian,
+    skew,
+)
+from imu_fusion.kernels import njit
 
 N = 9    # of state.PRINTED: attitude, bias, relative field
 

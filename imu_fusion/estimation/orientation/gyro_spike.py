@@ -3,6 +3,8 @@
 from imu_fusion.kernels import njit
 
 _SPIKE = 10.0              # rad/s within a sample: more than a tap on the sensor (7 were seen)
+# Times the usual change that makes a rate suspect. In the recordings of bags/ (230 000 samples)
+# 999 of 1000 changes stay below 7, and the largest is 24.
 _SPIKE_CHANGES = 20.0
 _SPIKE_MEMORY = 1.0        # s, over which changes are usual
 _SPIKE_STEP = 0.05         # s: between slower samples anything can happen

@@ -1,6 +1,7 @@
 """Imu samples that cannot be used: broken ones, and those that are not newer than the last."""
 
 import numpy as np
+
 from imu_fusion.kernels import njit
 
 # What no sensor of this world reports, whatever its unit: a broken message.

@@ -8,17 +8,14 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from imu_fusion.kernels import entry_point, njit
 
-from imu_fusion.estimation.orientation import fusion
-from imu_fusion.estimation.orientation import gyro_limit
-from imu_fusion.estimation.orientation import gyro_mag
-from imu_fusion.estimation.orientation import mag_queue
+from imu_fusion.estimation.orientation import fusion, gyro_limit, gyro_mag, mag_queue
 from imu_fusion.estimation.orientation.alignment import Alignment
 from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.estimation.orientation.state import new_state
+from imu_fusion.kernels import entry_point, njit
 
 CURSOR = np.dtype([("imu", "i8"), ("mag", "i8"), ("row", "i8")])
 """How far :func:`forward` is: samples taken of both logs, rows written."""

@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.orientation import mag_rejection
-from imu_fusion.estimation.orientation import rotation_history
+from imu_fusion.estimation.orientation import mag_rejection, rotation_history
 from imu_fusion.estimation.orientation.state import QUEUE_LENGTH
+from imu_fusion.kernels import njit
 
 TAKEN = np.dtype([
     ("field", "f8", 3),     # T, calibrated, imu axes at its own time

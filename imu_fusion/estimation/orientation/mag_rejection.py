@@ -11,10 +11,10 @@ repeat counts only while another axis still moves by more than four of its steps
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation.imu_rejection import is_within
 from imu_fusion.estimation.orientation.rows import FLAG_MAG_SATURATED
+from imu_fusion.kernels import njit
 
 _WILD_FIELD = 1e6          # T: what no sensor reports, whatever its unit
 _NO_FIELD = 1e-9           # T: zeros of a magnetometer that is not there; rooms shield to more

@@ -2,9 +2,8 @@
 
 import math
 
-from imu_fusion.kernels import njit
-
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.kernels import njit
 
 _HIGH_PASS_TIME = 5.0      # s: velocity changes faster than this show
 _MOTION_TIME = 30.0        # s: over which the size of the motion is judged

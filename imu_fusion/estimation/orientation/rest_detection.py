@@ -1,8 +1,7 @@
 """When the sensor is at rest."""
 
-from imu_fusion.kernels import njit
-
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.kernels import njit
 
 REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_TURN = 1.5e-3       # rad/s per axis: slower turning than 0.5 deg/s passes as rest

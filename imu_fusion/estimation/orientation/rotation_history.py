@@ -6,11 +6,15 @@ carries a sample from its own time to the newest Imu sample: that is how sensor
 delays, late arrival and different rates are all handled by one mechanism.
 """
 
-from imu_fusion.kernels import njit
-
 from imu_fusion.estimation.orientation.state import HISTORY_LENGTH
 from imu_fusion.geometry.rotation import (
-    quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize)
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_normalize,
+)
+from imu_fusion.kernels import njit
 
 
 @njit

@@ -3,10 +3,15 @@
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix)
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_to_matrix,
+)
+from imu_fusion.kernels import njit
 
 ORIENTATION_DTYPE = np.dtype([
     ("stamp", "<i8"), ("quat_world_imu", "<f8", 4), ("cov_attitude", "<f8", (3, 3)),

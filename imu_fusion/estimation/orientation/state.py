@@ -8,7 +8,7 @@ records of their own. Rates are rad/s in imu axes, specific forces m/s^2, stamps
 
 import numpy as np
 
-from imu_fusion.estimation.orientation.error_state import N, PREDICTION
+from imu_fusion.estimation.orientation.error_state import PREDICTION, N
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
 QUEUE_LENGTH = 128    # samples that wait: at 1 kHz more than the largest delay, 0.1 s
@@ -94,9 +94,9 @@ STEP = np.dtype([
 ], align=True)
 """What the newest Imu sample brought: between the parts of one step of the fusion filter."""
 
-COUNTS = np.dtype([(name, "i8") for name in (
-    "imu_used", "imu_rejected", "mag_used", "mag_rejected", "mag_late", "mag_disturbed",
-    "mag_saturated", "gaps", "saturated", "rates_held")], align=True)
+COUNT_NAMES = ("imu_used", "imu_rejected", "mag_used", "mag_rejected", "mag_late", "mag_disturbed",
+               "mag_saturated", "gaps", "saturated", "rates_held")
+COUNTS = np.dtype([(name, "i8") for name in COUNT_NAMES], align=True)
 """What became of the samples: used; refused as impossible, out of order or too many; too late;
 disturbed; with an axis at its limit; steps with a gap; Imu samples at a limit; rates held."""
 

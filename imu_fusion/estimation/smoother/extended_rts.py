@@ -15,18 +15,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.smoother.events import find_jump, jump_result
 from imu_fusion.estimation.smoother.extended_rts_model import (
     DA, DW, ENU_NED, Model, Q, R, SIZE, V, d_to_ned, rate_matrix, to_ned)
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors
-from imu_fusion.estimation.smoother.inputs import (holds, prepare_imu, prepare_measurements,
-                                                   reference_frame)
-from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
+from imu_fusion.estimation.smoother.imu_input import ImuInput, prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump
+from imu_fusion.estimation.smoother.jump_result import jump_result
+from imu_fusion.estimation.smoother.measurements.gnss_fix import required
+from imu_fusion.estimation.smoother.measurements.registry import (FIX, MAG, MEASUREMENTS, VELOCITY,
+                                                                  prepare_readings)
+from imu_fusion.estimation.smoother.measurements.surface_contact import holds
+from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult, reading_variances
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
+from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.geometry.geodesy import hill_axes
-from imu_fusion.geometry.gravity import normal_gravity
-from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
+from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
 _SEGMENT = 64   # samples kept at once on the way back
@@ -37,7 +42,6 @@ _P0 = np.square([5, 5, 15, 1, 1, 3, *[0.1] * 4, *[0.0873] * 3, *[0.2] * 3, *[5.0
 _R_READING = {FIX: np.square([3, 3, 5.0]), VELOCITY: np.square([0.1, 0.1, 0.3]),
               MAG: np.full(3, 25.0)}
 _R_NORM = 0.01 ** 2
-_NAMES = {FIX: "fix", VELOCITY: "velocity", MAG: "mag"}
 
 
 @dataclass(frozen=True)
@@ -67,10 +71,12 @@ class ExtendedRts:
     noise of unknown ones.
     """
 
-    def __init__(self, params, surface):
+    def __init__(self, params: SmootherParams, surface: Surface | None):
         self.params, self.surface = params, surface
 
-    def run(self, imu, mag, fix, velocity, events=None, initial_quat=None):
+    def run(self, imu: ImuLog, mag: MagLog | None, fix: FixLog | None,
+            velocity: VelocityLog | None, events: JumpEvents | None = None,
+            initial_quat: np.ndarray | None = None) -> SmootherResult:
         """See Smoother.run. Needs a magnetometer, fixes and velocities.
 
         ``cost`` of the result is half the sum of squares of all normalised innovations,
@@ -85,19 +91,15 @@ class ExtendedRts:
             raise EstimationError("method extended_rts knows hills only, no "
                                   f"{type(hill).__name__} (method: iterated)")
         prepared = prepare_imu(imu, params)
+        fix = required(fix)
         frame = reference_frame(hill, fix)
         if hill is not None and events is None:
             events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
-        measurements = prepare_measurements(frame, mag, fix, velocity, params)
-        gravity, field = params.gravity, params.magnetic_field
-        if gravity is None:
-            gravity = float(normal_gravity(frame.latitude_deg, frame.height))
-        if field is None:
-            field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg, frame.height,
-                                         decimal_year(fix.stamp[0]))
+        readings = prepare_readings({"fix": fix, "velocity": velocity, "mag": mag}, frame, params)
+        around = surroundings_of(params, frame, fix, magnetic=True)
         model = Model(hill.axes if hill is not None else hill_axes(0.0),
-                      np.array([0.0, 0.0, gravity]), ENU_NED @ np.asarray(field) * 1e6, hill)
-        data = _bind(model, prepared, measurements, events, params)
+                      np.array([0.0, 0.0, around.gravity]), ENU_NED @ around.magnetic_field, hill)
+        data = _bind(model, prepared, readings, events, params)
         try:
             samples, mag_errors, mag_sd, innovation, cost = _smooth(
                 model, data, _first_state(model, data, initial_quat))
@@ -108,27 +110,35 @@ class ExtendedRts:
         if not prepared.recorded.all():
             samples, mag_errors, mag_sd = (v[prepared.recorded]
                                            for v in (samples, mag_errors, mag_sd))
-        noise = reading_variances(samples["stamp"], params)
-        lost = noise * np.square([
-            params.gap.gyro_noise_density / params.sensor.gyro_noise_density,
-            params.gap.acc_noise_density / params.sensor.acc_noise_density])
-        for i, name in enumerate(("gyr", "acc")):
-            clipped = prepared.clipped[prepared.recorded, 3 * i:3 * i + 3]
-            samples[name + "_sd"] = np.sqrt(samples[name + "_bias_sd"] ** 2
-                                            + np.where(clipped, lost[i], noise[i]))
+        _put_reading_sds(samples, prepared, params)
         states = {"mag_bias": (1e-6 * mag_errors[:, :3], 1e-6 * mag_sd[:, :3]),
                   "mag_scale": (mag_errors[:, 3:], mag_sd[:, 3:])}
-        stamps = measurements.stamp[data.order]
-        innovations = {name: (stamps[data.kind == kind], innovation[data.kind == kind])
-                       for kind, name in _NAMES.items()}
-        jump = jump_result(hill, samples, prepared.log, events) if hill is not None else None
+        stamps = readings["stamp"][data.order]
+        innovations = {m.name: (stamps[data.kind == kind], innovation[data.kind == kind])
+                       for kind, m in enumerate(MEASUREMENTS) if np.any(data.kind == kind)}
+        jump = None
+        if hill is not None and events is not None:
+            jump = jump_result(hill, samples, prepared.log, events)
         constraints = () if hill is None else hill.constraints()
         fits = surface_fits(constraints, samples, states, events, params)
         return SmootherResult(samples, frame, states, innovations, (cost,), 1, None, events, jump,
                               fits)
 
 
-def _bind(model, prepared, measurements, events, params):
+def _put_reading_sds(samples: np.ndarray, prepared: ImuInput, params: SmootherParams) -> None:
+    """Standard deviations of the corrected readings: their bias and noise, or that of unknown
+    ones where they were clipped."""
+    noise = reading_variances(samples["stamp"], params)
+    lost = noise * np.square([
+        params.gap.gyro_noise_density / params.sensor.gyro_noise_density,
+        params.gap.acc_noise_density / params.sensor.acc_noise_density])
+    for i, name in enumerate(("gyr", "acc")):
+        clipped = prepared.clipped[prepared.recorded, 3 * i:3 * i + 3]
+        samples[name + "_sd"] = np.sqrt(samples[name + "_bias_sd"] ** 2
+                                        + np.where(clipped, lost[i], noise[i]))
+
+
+def _bind(model, prepared, readings, events, params):
     """The recording as :class:`_Data`: readings within the Imu's span at their nearest samples,
     in the frames of the outputs (48).
 
@@ -139,12 +149,12 @@ def _bind(model, prepared, measurements, events, params):
         EstimationError: a kind of reading is missing.
     """
     log = prepared.log
-    inside = (measurements.stamp >= log.stamp[0]) & (measurements.stamp <= log.stamp[-1])
+    inside = (readings["stamp"] >= log.stamp[0]) & (readings["stamp"] <= log.stamp[-1])
     middle = log.stamp[:-1] + np.diff(log.stamp) // 2
-    sample = np.searchsorted(middle, measurements.stamp)
-    order = np.lexsort((measurements.stamp, measurements.kind, sample))
+    sample = np.searchsorted(middle, readings["stamp"])
+    order = np.lexsort((readings["stamp"], readings["kind"], sample))
     order = order[inside[order]]
-    kind, value = measurements.kind[order], measurements.value[order]
+    kind, value = readings["kind"][order], readings["value"][order]
     if not np.any(kind == FIX):
         raise EstimationError("no fix lies within the Imu recording: do the stamps belong "
                               "together?")
@@ -182,18 +192,20 @@ def _update(model, data, k, x, cov):
         State and covariance; the innovations, each by its standard deviation given those before
         it: readings first.
     """
-    innovation, jacobian, variance = [], [], []
+    deviation: list[float] = []
+    jacobian: list[np.ndarray] = []
+    variance: list[float] = []
     for i in range(data.start[k], data.start[k + 1]):
         predicted, h = model.output(data.kind[i], x)
-        innovation.extend(data.value[i] - predicted)
+        deviation.extend(data.value[i] - predicted)
         jacobian.extend(h)
         variance.extend(_R_READING[data.kind[i]])
     active = [name for name, mask in data.active.items() if mask[k]]
     for name, (value, h) in model.constraints(x, active).items():
-        innovation.append(-value)
+        deviation.append(-value)
         jacobian.append(h)
         variance.append(data.sigma[name] ** 2)
-    innovation, h = np.array(innovation), np.array(jacobian)
+    innovation, h = np.array(deviation), np.array(jacobian)
     spread = h @ cov @ h.T + np.diag(variance)
     gain = np.linalg.solve(spread, h @ cov).T
     x = x + gain @ innovation

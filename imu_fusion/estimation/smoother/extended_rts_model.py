@@ -9,13 +9,15 @@ body axes, quaternion (w, x, y, z) of the body against north-east-down (O); magn
 quantities in microtesla.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from imu_fusion.estimation.smoother.model import FIX, VELOCITY
+from imu_fusion.estimation.smoother.measurements.registry import FIX, VELOCITY
 from imu_fusion.geometry.rotation import skew
+from imu_fusion.surfaces.hill import Hill
 
 #: Where a state x (22,) has position, velocity, quaternion and the errors of gyroscope,
 #: accelerometer, magnetometer (bias, scale); its size.
@@ -27,13 +29,13 @@ _EYE = np.eye(3)
 ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-def to_ned(q):
+def to_ned(q: np.ndarray) -> np.ndarray:
     """M_BO transposed (47), without normalisation, as the derivatives need it."""
     w, v = q[0], q[1:]
     return (w * w - v @ v) * _EYE + 2.0 * v[:, None] * v + 2.0 * w * skew(v)
 
 
-def d_to_ned(q, u):
+def d_to_ned(q: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Derivative (3, 4) of M_BO' u by q."""
     w, v = q[0], q[1:]
     out = np.empty((3, 4))
@@ -48,13 +50,13 @@ def _d_to_body(q, u):
     return d_to_ned(conjugate, u) * [1.0, -1.0, -1.0, -1.0]
 
 
-def rate_matrix(q):
+def rate_matrix(q: np.ndarray) -> np.ndarray:
     """The matrix of (46), (4, 3)."""
     w, x, y, z = q
     return np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
 
 
-def discretise(a, f, dt):
+def discretise(a: np.ndarray, f: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Phi (7) and Gamma (9) of an interval by their series; with B for F, (8).
 
     Args:
@@ -84,14 +86,14 @@ class Model:
     axes: np.ndarray
     gravity_ned: np.ndarray
     field_ned: np.ndarray
-    hill: object = None
+    hill: Hill | None = None
 
     @cached_property
-    def to_hill(self):
+    def to_hill(self) -> np.ndarray:
         """M_NO (31), (3, 3)."""
         return self.axes @ ENU_NED
 
-    def rate(self, x, u):
+    def rate(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The state equations (44)-(46) for inputs u (6,); parameters stand still (22)."""
         omega, force = u[:3] - x[DW], u[3:] - x[DA]
         turn = to_ned(x[Q])
@@ -101,7 +103,7 @@ class Model:
         rate[Q] = 0.5 * rate_matrix(x[Q]) @ omega
         return rate
 
-    def jacobians(self, x, u):
+    def jacobians(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of :meth:`rate`: A (22, 22) by the state, F (22, 6) by the noise (43)."""
         omega = u[:3] - x[DW]
         a, f = np.zeros((SIZE, SIZE)), np.zeros((SIZE, 6))
@@ -117,7 +119,8 @@ class Model:
         f[:, :3], f[:, 3:] = a[:, DW], a[:, DA]
         return a, f
 
-    def predict(self, x, cov, u0, u1, dt, q):
+    def predict(self, x: np.ndarray, cov: np.ndarray, u0: np.ndarray, u1: np.ndarray, dt: float,
+                q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Equations (12), (13): Runge-Kutta with inputs that go linearly from u0 to u1.
 
         Args:
@@ -127,7 +130,8 @@ class Model:
         Returns:
             State, covariance, Phi.
         """
-        phi, gamma = discretise(*self.jacobians(x, u0), dt)
+        a, f = self.jacobians(x, u0)
+        phi, gamma = discretise(a, f, dt)
         middle = 0.5 * (u0 + u1)
         k1 = self.rate(x, u0)
         k2 = self.rate(x + 0.5 * dt * k1, middle)
@@ -136,7 +140,7 @@ class Model:
         return (x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4),
                 phi @ cov @ phi.T + (gamma * q) @ gamma.T, phi)
 
-    def output(self, kind, x):
+    def output(self, kind: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Reading of a kind (FIX, VELOCITY, MAG) as predicted (3,) by (48)-(50) and its
         derivative (3, 22): m in the hill frame, m/s north-east-down, microtesla in body axes."""
         h = np.zeros((3, SIZE))
@@ -152,7 +156,7 @@ class Model:
         h[:, DM], h[:, DS] = _EYE, np.diag(body)
         return scale * body + x[DM], h
 
-    def constraints(self, x, names):
+    def constraints(self, x: np.ndarray, names: Sequence[str]) -> dict[str, tuple]:
         """The norm and those of the hill's constraints that are named, (51): name -> (value,
         derivative (22,)), m, of the quaternion without unit."""
         norm = np.linalg.norm(x[Q])
@@ -165,6 +169,8 @@ class Model:
                 h[1] = 1.0
                 rows[name] = (x[1], h)
                 continue
+            if self.hill is None:
+                raise ValueError(f"constraint {name} is one of a hill")
             profile = self.hill.in_run if name == "in_run" else self.hill.landing
             z, slope, _ = profile(x[0])
             h[0], h[2] = -slope, 1.0

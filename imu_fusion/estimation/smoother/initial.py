@@ -3,8 +3,22 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.smoother.measurements.registry import FIX, MAG, VELOCITY
+from imu_fusion.estimation.smoother.problem import Problem
+from imu_fusion.estimation.smoother.state import POS, VEL
+from imu_fusion.samples.logs import MagLog
 
-def attitude_from_vectors(acc, mag, field_world):
+# ns at the beginning, whose mean force and field are taken: long enough against noise, short
+# against motion.
+_FIRST = 200_000_000
+# First headings tried: quarter turns insure against a disturbed or mounted-over magnetometer;
+# without one, steps of 30 deg lead into the right minimum.
+_HEADINGS, _HEADINGS_BLIND = 4, 12
+
+
+def attitude_from_vectors(acc: np.ndarray, mag: np.ndarray | None, field_world: np.ndarray
+                          ) -> np.ndarray:
     """Attitude from one pair of directions; the force alone fixes the tilt and the field alone
     the heading, as the factored quaternion algorithm of Fang 2020 does (section 4.1).
 
@@ -31,8 +45,43 @@ def attitude_from_vectors(acc, mag, field_world):
     return Rotation.from_matrix(world.T @ body).as_quat()
 
 
-def headings(quat, count):
+def headings(quat: np.ndarray, count: int) -> np.ndarray:
     """``count`` attitudes (count, 4): ``quat`` turned about the vertical in equal steps."""
     angles = 2.0 * np.pi * np.arange(count)[:, None] / count
     turns = Rotation.from_rotvec(angles * [0.0, 0.0, 1.0])
     return (turns * Rotation.from_quat(quat)).as_quat()
+
+
+def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarray | None
+                    ) -> np.ndarray:
+    """Set the first position and velocity of the problem's prior; attitudes (k, 4) to start from,
+    the most plausible first.
+
+    Args:
+        problem: not yet solved.
+        mag: the magnetometer's samples.
+        initial_quat: (4,) a first guess; found from force and field when None.
+
+    Raises:
+        EstimationError: no fix within the Imu samples.
+    """
+    kind, value = problem.readings["kind"], problem.readings["value"]
+    if not np.any(kind == FIX):
+        raise EstimationError("no fix lies within the Imu recording: do the stamps belong "
+                              "together?")
+    problem.mean[POS:POS + 3] = value[kind == FIX][0]
+    if np.any(kind == VELOCITY):
+        problem.mean[VEL:VEL + 3] = value[kind == VELOCITY][0]
+    log = problem.imu.log
+    beginning = int(np.searchsorted(log.stamp, log.stamp[0] + _FIRST))
+    candidates = _HEADINGS
+    if initial_quat is None:
+        reading = None
+        if mag is not None and np.any(kind == MAG):
+            early = mag.between(log.stamp[0], log.stamp[beginning] + 1)
+            finite = np.isfinite(early.mag).all(axis=1)
+            reading = early.mag[finite].mean(axis=0) if finite.any() else None
+        initial_quat = attitude_from_vectors(log.acc[:beginning].mean(axis=0), reading,
+                                             problem.around.magnetic_field)
+        candidates = _HEADINGS_BLIND if reading is None else _HEADINGS
+    return problem.rank(headings(initial_quat, candidates))

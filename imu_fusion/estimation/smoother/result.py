@@ -4,6 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
+from imu_fusion.estimation.smoother.jump_result import JumpResult
+from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.surface_fit import SurfaceFit
 from imu_fusion.geometry.geodesy import LocalFrame
 
 SAMPLE = np.dtype([
@@ -22,17 +27,10 @@ _EXCESS = 1.5                # of the deviation from a surface; see smoother_sur
 _SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
-_CAUSES = {
-    "fix": "the covariances of the messages (gnss.covariances: false) or gnss.fix_sd may be too small, "
-           "the stamps late (gnss.time_offset_sd: 0.2 finds it) or the errors wander "
-           "(gnss.position_error_sd)",
-    "velocity": "the covariances of the messages (gnss.covariances: false) or gnss.velocity_sd may be "
-                "too small, the stamps late (gnss.velocity_time_offset_sd: 0.2 finds it) or filtered "
-                "(gnss.velocity_error_sd, gnss.min_interval)",
-    "mag": "the field may be disturbed, or sensor.mag_noise_sd, mag_bias_sd and mag_scale_sd too small"}
+_ADVICE = {m.name: m.advice for m in MEASUREMENTS}
 
 
-def reading_variances(stamp, params):
+def reading_variances(stamp: np.ndarray, params: SmootherParams) -> np.ndarray:
     """Variances (2,) of the noise in one sample of rate and of force, of the stated densities.
 
     Args:
@@ -61,16 +59,16 @@ class SmootherResult:
 
     samples: np.ndarray
     frame: LocalFrame
-    states: dict
-    innovations: dict
-    cost: tuple
+    states: dict[str, tuple[np.ndarray, np.ndarray]]
+    innovations: dict[str, tuple[np.ndarray, np.ndarray]]
+    cost: tuple[float, ...]
     iterations: int
     converged: bool | None
-    events: object = None
-    jump: object = None
-    surface: dict = field(default_factory=dict)
+    events: JumpEvents | None = None
+    jump: JumpResult | None = None
+    surface: dict[str, SurfaceFit] = field(default_factory=dict)
 
-    def summary(self):
+    def summary(self) -> str:
         """One line."""
         jump = f", jump length {self.jump.length:.1f} m" if self.jump else ""
         state = "converged" if self.converged else "did not converge"
@@ -78,7 +76,7 @@ class SmootherResult:
             f"{self.iterations} iterations ({state})"
         return f"{len(self.samples)} samples, {steps}, cost {self.cost[-1]:.6g}{jump}"
 
-    def misfit(self):
+    def misfit(self) -> dict[str, float]:
         """Name -> typical size of its innovations, in standard deviations: 1 where the model is
         right. By the median, so that outliers do not count."""
         return {name: float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
@@ -94,7 +92,7 @@ class SmootherResult:
             return None
         rms = {name: float(np.sqrt(np.mean(values ** 2)))
                for name, (_, values) in self.innovations.items() if len(values)}
-        name = max(rms, key=rms.get, default=None)
+        name = max(rms, key=lambda name: rms[name], default=None)
         return (name, rms[name]) if name and rms[name] > _SINGLE_PASS else None
 
     def _beside(self):
@@ -107,7 +105,7 @@ class SmootherResult:
         certain = np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values))
         return middle if certain else None
 
-    def remarks(self):
+    def remarks(self) -> list[str]:
         """What a user should know before trusting the result: texts."""
         texts = []
         if self.converged is False:
@@ -122,13 +120,14 @@ class SmootherResult:
         for name, size in self.misfit().items():
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
-                             f"standard deviations: {_CAUSES.get(name, _CAUSES['fix'])}")
+                             f"standard deviations: {_ADVICE[name]}")
         beside = self._beside()
         if beside is not None:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "
                          + "/".join(f"{b:+.1f}" for b in beside) + " (east/north/up) of their "
                          "standard deviations: the origin of the surface may be off, the sensor "
-                         "ride above it (surface.body_height) or the fixes wander (gnss.position_error_sd)")
+                         "ride above it (surface.body_height) or the fixes wander "
+                         "(gnss.position_error_sd)")
         for name, fit in self.surface.items():
             if fit.silent > _SILENT:
                 texts.append(f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of "

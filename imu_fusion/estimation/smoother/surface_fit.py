@@ -1,12 +1,17 @@
 """How well a smoothed trajectory keeps to its surface."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.smoother.inputs import evaluate_constraints, holds, surface_points
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
+from imu_fusion.estimation.smoother.measurements.surface_contact import (
+    evaluate_constraints, holds, surface_points)
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.surfaces.constraint import Constraint
 
 _STRETCH = 1.0  # s, over which deviations are averaged: slower than what the Imu itself holds
 
@@ -32,7 +37,8 @@ class SurfaceFit:
     silent: float = 0.0
 
 
-def at_surface(samples, states, params):
+def at_surface(samples: np.ndarray, states: dict[str, tuple[np.ndarray, np.ndarray]],
+               params: SmootherParams) -> np.ndarray:
     """Samples whose position and velocity, with covariances, are those of the point that is held
     on the surface: p + R l, v + R (w x l).
 
@@ -69,7 +75,9 @@ def at_surface(samples, states, params):
     return moved
 
 
-def surface_fits(constraints, samples, states, events, params):
+def surface_fits(constraints: Sequence[Constraint], samples: np.ndarray,
+                 states: dict[str, tuple[np.ndarray, np.ndarray]], events: JumpEvents | None,
+                 params: SmootherParams) -> dict[str, SurfaceFit]:
     """Name of the constraint -> :class:`SurfaceFit`, for those that hold anywhere.
 
     Args:
@@ -82,8 +90,9 @@ def surface_fits(constraints, samples, states, events, params):
     fits = {}
     position_world = at_surface(samples, states, params)["position_world"]
     for constraint in constraints:
-        start, residual, _, sigma, _ = evaluate_constraints(
+        start, contacts = evaluate_constraints(
             [constraint], position_world, samples["stamp"], events, params)
+        residual = contacts["residual"]
         if not len(residual):
             continue
         sample = np.repeat(np.arange(len(samples)), np.diff(start))
@@ -96,7 +105,8 @@ def surface_fits(constraints, samples, states, events, params):
         fits[constraint.name] = SurfaceFit(
             sample, residual, constraint.sigma, float(np.sqrt(np.mean(residual ** 2))),
             float(np.abs(residual).max()),
-            _excess(samples["stamp"][sample], residual, sigma, params.surface.interval),
+            _excess(samples["stamp"][sample], residual, contacts["sigma"],
+                    params.surface.interval),
             1.0 - len(residual) / active.sum())
     if constraints and not fits:
         raise EstimationError("the surface says nothing at any sample of this recording: an "

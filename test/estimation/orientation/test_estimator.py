@@ -7,9 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.estimation.orientation.estimator import (
-    ORIENTATION_DTYPE, OrientationEstimator, OrientationParams)
 from imu_fusion.estimation.orientation.alignment import triad
+from imu_fusion.estimation.orientation.estimator import (
+    ORIENTATION_DTYPE,
+    OrientationEstimator,
+    OrientationParams,
+)
 from imu_fusion.estimation.orientation.rows import FLAG_ALIGNING, FLAG_GAP
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
@@ -29,7 +32,8 @@ def errors_deg(rows, truth):
 
 
 @pytest.fixture(scope="module", params=[
-    dict(method="gyro_mag"), {"method": "gyro_mag", "gyro_mag.as_printed": True}, dict(method="fusion")],
+    dict(method="gyro_mag"), {"method": "gyro_mag", "gyro_mag.as_printed": True},
+    dict(method="fusion")],
     ids=["gyro_mag", "as printed", "fusion"])
 def params(request):
     return OrientationParams.from_mapping(request.param)

@@ -10,7 +10,12 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation.rows import (
-    FLAG_HELD, FLAG_MAG_DISTURBED, FLAG_NO_HEADING, FLAG_SATURATED, FLAG_STILL)
+    FLAG_HELD,
+    FLAG_MAG_DISTURBED,
+    FLAG_NO_HEADING,
+    FLAG_SATURATED,
+    FLAG_STILL,
+)
 from imu_fusion.parameters.file import load
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import saturated_axes

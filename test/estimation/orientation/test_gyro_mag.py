@@ -22,8 +22,8 @@ ORDINARY = Sensors(gyr_density=2e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.
 PRINTED = {"gyro_mag.as_printed": True}
 
 
-def run(imu, mag, changes={}):
-    return make({"method": "gyro_mag", "sensor.axes_sd": 0.0, **changes}).run(imu, mag)
+def run(imu, mag, changes=None):
+    return make({"method": "gyro_mag", "sensor.axes_sd": 0.0} | (changes or {})).run(imu, mag)
 
 
 def local_errors(rows, truth):

@@ -13,7 +13,7 @@ from benchmarks.jumps import score
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams, extended_rts
 from imu_fusion.estimation.smoother.extended_rts_model import Model, discretise
-from imu_fusion.estimation.smoother.model import FIX, MAG, VELOCITY
+from imu_fusion.estimation.smoother.measurements.registry import FIX, MAG, VELOCITY
 from imu_fusion.simulation.jump_sensors import EPOCH, record
 from imu_fusion.simulation.ski_jump import SkiJump
 from imu_fusion.surfaces.file import load_surface, surface_from_mapping

@@ -125,7 +125,8 @@ def test_indoor_walk_admits_what_its_position_is_worth():
                     for c in columns["Gyroscope"][:, 1:].T], axis=1)
     place = columns["Location"]
     cov = np.eye(3) * place[:, 6, None, None] ** 2
-    params = SmootherParams(gnss=Gnss(position_error_sd=(22.0, 22.0, 22.0), position_error_tau=60.0))
+    params = SmootherParams(gnss=Gnss(position_error_sd=(22.0, 22.0, 22.0),
+                                      position_error_tau=60.0))
     result = Smoother(params).run(
         ImuLog(stamp["Accelerometer"], gyr=gyr, acc=columns["Accelerometer"][:, 1:]),
         MagLog(stamp["Magnetometer"], columns["Magnetometer"][:, 1:] * 1e-6),

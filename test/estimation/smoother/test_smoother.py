@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.smoother.events import JumpEvents, detect_jump, find_jump
+from imu_fusion.estimation.smoother.jump_events import JumpEvents, detect_jump, find_jump
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.estimation.smoother.inputs import even_stamps, spaced
+from imu_fusion.estimation.smoother.measurements.gnss import even_stamps, spaced
 from imu_fusion.estimation.smoother.params import Gnss, Iteration, Jump, Sensor
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
@@ -47,8 +47,8 @@ def test_corrected_readings_err_as_they_say(jump):
     """Clipped ones too: rates beyond 2 rad/s (some 30 samples per axis), and the impact."""
     r = record(jump, np.random.default_rng(8), PhoneErrors(gyr_range=2.0))
     imu = dataclasses.replace(r.imu, acc=np.clip(r.imu.acc, -40.0, 40.0))
-    s = Smoother(SmootherParams(sensor=Sensor(gyro_range=(2.0,), acc_range=(40.0,))), jump.hill).run(
-        imu, r.mag, r.fix, r.velocity).samples
+    params = SmootherParams(sensor=Sensor(gyro_range=(2.0,), acc_range=(40.0,)))
+    s = Smoother(params, jump.hill).run(imu, r.mag, r.fix, r.velocity).samples
     true = period_means(jump, (imu.stamp - EPOCH) * 1e-9, 0.01)
     for name, raw, truth, limit, noise in (("gyr", imu.gyr, true[0], 2.0, 0.0175),
                                            ("acc", imu.acc, true[1], 40.0, 0.1)):
@@ -149,7 +149,8 @@ def test_filtered_velocities_need_their_state(jump):
     """A receiver's filter makes its velocity errors wander: as white ones they are believed too
     much."""
     sd = tuple(np.sqrt(0.95) * np.array(Gnss().velocity_sd))
-    models = (SmootherParams(), SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)))
+    models = (SmootherParams(),
+              SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)))
     found = []
     for seed in range(4):
         filtered = record(jump, np.random.default_rng(seed), gnss=GnssErrors(velocity_tau=1.0))

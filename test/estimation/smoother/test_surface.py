@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.jumps import moved
 from imu_fusion.errors import EstimationError, ParameterError
-from imu_fusion.estimation.smoother.events import JumpEvents
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
-from imu_fusion.estimation.smoother.inputs import evaluate_constraints
+from imu_fusion.estimation.smoother.measurements.surface_contact import evaluate_constraints
 from imu_fusion.estimation.smoother.params import Gnss, SurfaceContact
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
@@ -67,12 +67,12 @@ def test_a_surface_says_as_much_per_second_at_any_rate(jump):
         stamp = EPOCH + np.arange(10 * rate + 1) * (10**9 // rate)
         place = jump.at((stamp - EPOCH) * 1e-9).position_world
         events = JumpEvents(EPOCH + int(20e9), EPOCH + int(25e9))
-        start, _, gradient, sigma, _ = evaluate_constraints(
+        start, contacts = evaluate_constraints(
             jump.hill.constraints(), place, stamp, events, SmootherParams())
         assert start[-1] == 2 * len(stamp)  # height and lateral, in-run only
-        said.append(np.sum(1.0 / sigma ** 2))
+        said.append(np.sum(1.0 / contacts["sigma"] ** 2))
         if rate == 100:
-            assert np.allclose(sigma, 0.1, rtol=1e-12)  # as the paper has it
+            assert np.allclose(contacts["sigma"], 0.1, rtol=1e-12)  # as the paper has it
     # A simulated sensor moves against the skis with the density of these rows.
     allowed = 0.1 * np.sqrt(2.0 * SurfaceContact().interval * FASTEST_WOBBLE)
     assert abs(jump.params.wobble / allowed - 1) < 0.02

@@ -4,9 +4,8 @@ Zero-mean pseudo-measurements with the standard deviations and correlation times
 Gravity's direction follows from that, without ever taking the specific force for gravity.
 """
 
-from imu_fusion.kernels import njit
-
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.kernels import njit
 
 NAME = "bounded motion"
 _REST_SPEED_SD = 0.003     # m/s, over 20 ms: a sensor that rests in a quiet hand

@@ -8,11 +8,16 @@ the more they differ from what was expected.
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.geometry.rotation import (
-    quat_exp, quat_multiply, quat_rotate, quat_rotate_inverse, quat_to_matrix)
+    quat_exp,
+    quat_multiply,
+    quat_rotate,
+    quat_rotate_inverse,
+    quat_to_matrix,
+)
+from imu_fusion.kernels import njit
 
 NAME = "magnetometer"
 _FIRST_FIELD_SD = 2e-3     # relative: noise of the field that the alignment averages

@@ -1,9 +1,11 @@
-"""At rest the mean rate is the gyroscope's bias. (That the velocity is zero, bounded_motion says.)"""
+"""At rest the mean rate is the gyroscope's bias. (That velocity is zero, bounded_motion says.)
 
-from imu_fusion.kernels import njit
+Columns of the scale are left out: they are the mean rate at rest itself, the bias of 0.01 rad/s.
+"""
 
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation.rest_detection import REST_MEMORY
+from imu_fusion.kernels import njit
 
 NAME = "rest"
 

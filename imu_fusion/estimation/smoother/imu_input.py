@@ -1,0 +1,110 @@
+"""From logs to what the smoother starts from: where the world is, Imu samples with gaps bridged and
+clipped readings flagged."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError, SampleError
+from imu_fusion.estimation.smoother.measurements.gnss_fix import valid_fixes
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.samples.logs import FixLog, ImuLog
+from imu_fusion.surfaces.constraint import Surface
+
+_FAR = 50e3   # m from the origin of a surface, where its plane of axes no longer describes it
+_LEAST = 10   # Imu samples: of fewer, steps and noise of a sample have no meaning
+_FULL_SCALE = 0.999   # of a range from which on a reading counts as clipped: logs round it
+
+
+def reference_frame(surface: Surface | None, fix: FixLog) -> LocalFrame:
+    """The surface's frame, or one at the first valid fix.
+
+    Raises:
+        EstimationError: the surface is elsewhere.
+    """
+    i = np.flatnonzero(valid_fixes(fix))[0]
+    first = float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
+    if surface is None:
+        return LocalFrame(*first)
+    away = float(np.linalg.norm(surface.origin.to_enu(*first)))
+    if away > _FAR:
+        raise EstimationError(
+            f"the surface's origin is {away / 1e3:.0f} km from the first fix (latitude "
+            f"{first[0]:.5f}, longitude {first[1]:.5f}): the surface is not that of this "
+            "recording, or its origin is mistyped")
+    return surface.origin
+
+
+@dataclass(frozen=True)
+class ImuInput:
+    """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped`` (N, 6) the rates
+    and forces out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
+
+    log: ImuLog
+    recorded: np.ndarray
+    clipped: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def steps(self) -> np.ndarray:
+        """dt (N - 1,) s."""
+        return np.diff(self.log.stamp) * 1e-9
+
+    @property
+    def means(self) -> np.ndarray:
+        """Mean rates and forces of the intervals (N - 1, 6)."""
+        both = np.concatenate([self.log.gyr, self.log.acc], axis=1)
+        return 0.5 * (both[1:] + both[:-1])
+
+
+def prepare_imu(imu: ImuLog, params: SmootherParams) -> ImuInput:
+    """Check the Imu samples, bridge gaps, flag what was clipped.
+
+    Samples that are not finite are left out, and so is the second of two with one stamp.
+
+    Raises:
+        SampleError: stamps that go backwards, fewer than ten samples.
+    """
+    back = np.flatnonzero(np.diff(imu.stamp) < 0)
+    if len(back):
+        raise SampleError(f"Imu stamps go backwards after {imu.stamp[back[0]]} ns: sort the "
+                          "recording or cut it there")
+    good = np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1)
+    good[1:] &= np.diff(imu.stamp) > 0
+    imu = imu[good]
+    if len(imu) < _LEAST:
+        raise SampleError(f"{len(imu)} usable Imu samples: the smoother needs at least {_LEAST}")
+    imu, recorded = _bridged(imu, params.gap.max)
+    sensor, gap = params.sensor, params.gap
+    noise, clipped = [], []
+    for values, limit, density, unknown in (
+            (imu.gyr, sensor.gyro_range, sensor.gyro_noise_density, gap.gyro_noise_density),
+            (imu.acc, sensor.acc_range, sensor.acc_noise_density, gap.acc_noise_density)):
+        lost = np.repeat(~recorded[:, None], 3, axis=1)
+        if limit is not None:
+            lost |= np.abs(values) >= _FULL_SCALE * np.array(limit)
+        clipped.append(lost & recorded[:, None])
+        either = lost[1:] | lost[:-1]
+        noise.append(np.where(either, unknown, density) ** 2)
+    return ImuInput(imu, recorded, np.concatenate(clipped, axis=1), np.concatenate(noise, axis=1))
+
+
+def _bridged(imu: ImuLog, longest: float) -> tuple[ImuLog, np.ndarray]:
+    """The log with samples at the usual step in its gaps (steps of more than ``longest`` s), on
+    straight lines; mask of those recorded."""
+    steps = np.diff(imu.stamp)
+    nominal = int(np.median(steps))
+    gaps = np.flatnonzero(steps > max(longest * 1e9, 1.5 * nominal))
+    recorded = np.ones(len(imu), bool)
+    if not len(gaps):
+        return imu, recorded
+    added = np.concatenate([
+        np.arange(imu.stamp[g] + nominal, imu.stamp[g + 1] - nominal // 2, nominal) for g in gaps])
+    stamp = np.concatenate([imu.stamp, added])
+    order = np.argsort(stamp, kind="stable")
+    recorded = np.concatenate([recorded, np.zeros(len(added), bool)])[order]
+    since = stamp[order] - imu.stamp[0]
+    gyr, acc = (np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v[:, i])
+                                 for i in range(3)]) for v in (imu.gyr, imu.acc))
+    return ImuLog(stamp=stamp[order], gyr=gyr, acc=acc, frame_id=imu.frame_id), recorded

@@ -1,0 +1,54 @@
+"""All measurements of the smoother: the one place that lists them."""
+
+import numpy as np
+from imu_fusion.kernels import njit
+
+from imu_fusion.estimation.smoother.measurements import gnss_fix, gnss_velocity, magnetometer
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.records import READING
+from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.samples.logs import Log
+
+#: Kinds of readings are indices into this.
+MEASUREMENTS = (gnss_fix.MEASUREMENT, gnss_velocity.MEASUREMENT, magnetometer.MEASUREMENT)
+FIX, VELOCITY, MAG = range(len(MEASUREMENTS))
+
+#: Names of the states that are delays of stamps.
+DELAYS = tuple(dict.fromkeys(name for m in MEASUREMENTS for name in m.delays))
+
+
+@njit
+def predict(kind, x, tau, step, model, rows):
+    """What a reading of a kind should be (3,), and its derivative (3, n).
+
+    Compiled code can hold no cheap list of functions, so this is one.
+
+    Args:
+        kind: index of MEASUREMENTS. x: state (n + 1,) of the sample. tau: s after it.
+        step, model: records of STEP (the interval behind the sample) and MODEL.
+        rows: record of ROWS, ``h`` zero; the result is in ``predicted`` and ``h``.
+    """
+    if kind == FIX:
+        gnss_fix.predict(x, tau, step, model, rows)
+    elif kind == VELOCITY:
+        gnss_velocity.predict(x, tau, step, model, rows)
+    elif kind == MAG:
+        magnetometer.predict(x, tau, step, model, rows)
+
+
+def prepare_readings(logs: dict[str, Log | None], frame: LocalFrame, params: SmootherParams
+                     ) -> np.ndarray:
+    """Readings (m,) of records.READING that are fit for use, of all measurements in turn.
+
+    Args:
+        logs: by the name of the measurement; None: no such sensor.
+
+    Raises:
+        SampleError: covariances or stamps that cannot be.
+    """
+    parts = [np.empty(0, READING)]
+    for kind, measurement in enumerate(MEASUREMENTS):
+        log = logs.get(measurement.name)
+        if log is not None:
+            parts.append(measurement.prepare(log, frame, params).records(kind))
+    return np.concatenate(parts)

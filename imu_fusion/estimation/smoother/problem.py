@@ -1,0 +1,224 @@
+"""One recording as an optimisation problem: its trajectory, and the step that improves it."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_fusion.estimation.smoother.backward_pass import THINNING
+from imu_fusion.estimation.smoother.forward_filter import filter_segment, make_storage
+from imu_fusion.estimation.smoother.imu_input import ImuInput
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
+from imu_fusion.estimation.smoother.linear_solve import solve_linear
+from imu_fusion.estimation.smoother.measurements.registry import DELAYS, FIX, MEASUREMENTS
+from imu_fusion.estimation.smoother.measurements.surface_contact import (
+    evaluate_constraints, put_lever_derivatives, surface_points)
+from imu_fusion.estimation.smoother.motion import columns_of, intervals_of
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.records import CONTACT, MODEL, Recording, make_scratch
+from imu_fusion.estimation.smoother.state import (ATT, POS, SLOW, StatePrior, boxminus, slow_states)
+from imu_fusion.estimation.smoother.surroundings import Surroundings
+from imu_fusion.surfaces.constraint import Constraint
+
+_BEGINNING = 20_000_000_000   # ns, from which first attitudes are judged at least
+_MOVED = 20.0                 # sd of a fix, by which fixes have moved far beyond their noise
+_DELAY_SDS = 3.0              # standard deviations within which a delay of stamps is believed
+# Squared standard deviations of the Cauchy loss by which first attitudes are judged: wide enough
+# that a start that errs for a while is told from one that errs throughout.
+_JUDGED = 25.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a step did: ``largest`` changes (3,) in m, m/s, rad. If it was asked to: covariances
+    ``cov`` (N, 3, 3, 3) of position, velocity, attitude, and variances ``var`` (N, n - 9) of the
+    slow states."""
+
+    largest: np.ndarray
+    cov: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 3, 3)))
+    var: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def has_cov(self) -> bool:
+        """Whether it was asked for covariances."""
+        return len(self.cov) > 0
+
+
+def model_of(prior: StatePrior, around: Surroundings, lever_arm: Sequence[float]) -> np.ndarray:
+    """One-element array of MODEL; lever_arm: (3,) m, of the antenna."""
+    model = np.zeros(1, MODEL)
+    values = model[0]
+    values["gravity"], values["earth_rate"] = around.gravity, around.earth_rate
+    values["magnetic_field"], values["lever_arm"] = around.magnetic_field, lever_arm
+    values["blocks"] = tuple(prior.blocks)
+    n, columns = len(prior.sd), columns_of(prior.blocks)
+    values["decay_rate"][:n], values["walk"][:n] = prior.decay_rate, prior.walk
+    values["columns"][:len(columns)], values["n_columns"] = columns, len(columns)
+    return model
+
+
+class Problem:
+    """Everything fixed during the iteration, and the trajectory ``x`` (N, n + 1) with the
+    ``cost`` before each step.
+
+    Args:
+        imu: ImuInput. readings: (m,) of records.READING.
+        around: Surroundings.
+        constraints: of the surface.
+        prior: StatePrior, whose mean may be completed before the first step.
+    """
+
+    def __init__(self, imu: ImuInput, params: SmootherParams, readings: np.ndarray,
+                 around: Surroundings, constraints: Sequence[Constraint], prior: StatePrior):
+        self.imu, self.params, self.around = imu, params, around
+        self.constraints, self.prior = tuple(constraints), prior
+        self.mean, self.prior_sd = prior.mean.copy(), prior.sd
+        self.blocks, self.size = prior.blocks, len(prior.sd)
+        self.delays = [i for i in (getattr(prior.blocks, name) for name in DELAYS) if i >= 0]
+        self.model = model_of(prior, around, params.gnss.lever_arm)
+        self.intervals = intervals_of(imu.steps, imu.means, imu.noise)
+        self.contact_start = np.zeros(len(imu.log) + 1, np.int64)
+        self.contacts = np.empty(0, CONTACT)
+        self._start()
+        self._all_readings = readings
+        self._bound = np.zeros(len(MEASUREMENTS))
+        self.attach()
+
+    def _start(self) -> None:
+        self.x = np.zeros((len(self.imu.log), self.size + 1))
+        self.cost: list[float] = []
+        self._process = 0.0   # squared noise of the trajectory that the last step left
+
+    @property
+    def recording(self) -> Recording:
+        """For the kernels."""
+        return Recording(self.model, self.intervals, self.readings, self.reading_start,
+                         self.contacts, self.contact_start)
+
+    def attach(self, bind: bool = True) -> None:
+        """Place the readings in time, for the delays of their stamps found so far; with
+        ``bind`` anew at the sample before each, else after the sample that each is bound to,
+        unless the delays have moved by more than a step since.
+
+        Sets ``readings`` (M,), ``reading_start`` (N + 1,) and ``innovation`` (M, 3).
+        """
+        stamp = self.imu.log.stamp
+        late = np.array([sum(self._delay(name) for name in m.delays) for m in MEASUREMENTS])
+        taken = self._all_readings["stamp"] - np.round(late * 1e9).astype(
+            np.int64)[self._all_readings["kind"]]
+        if bind or np.abs(late - self._bound).max() > np.median(self.imu.steps):
+            self._bind(taken)
+            self._bound = late
+        self.readings = self._all_readings[self._order]
+        sample_stamp = np.repeat(stamp, np.diff(self.reading_start))
+        self.readings["tau"] = (taken[self._order] - sample_stamp) * 1e-9
+
+    def _delay(self, name: str) -> float:
+        """s, of the state of this name; 0 where there is none."""
+        i = getattr(self.blocks, name)
+        return 0.0 if i < 0 else float(slow_states(self.x[0], i, 1)[0])
+
+    def _bind(self, taken: np.ndarray) -> None:
+        """Bind each reading, taken at (m,) ns, to the sample before it."""
+        stamp = self.imu.log.stamp
+        order = np.flatnonzero((taken >= stamp[0]) & (taken <= stamp[-1]))
+        order = order[np.lexsort((self._all_readings["kind"][order], taken[order]))]
+        sample = np.searchsorted(stamp, taken[order], side="right") - 1
+        sample = np.minimum(sample, len(stamp) - 2)
+        self._order = order
+        self.reading_start = np.searchsorted(sample, np.arange(len(stamp) + 1))
+        self.innovation = np.zeros((len(order), 3))
+
+    def follow(self, count: int | None = None) -> float:
+        """Extended Kalman filter over the first ``count`` samples; writes x.
+
+        Returns:
+            How little it expected the readings: a heading is judged by that, not by what it ended
+            with.
+        """
+        self.x[0] = self.mean
+        count = len(self.x) if count is None else count
+        n = self.size
+        filter_segment(0, count, True, self.x, np.zeros(n), np.diag(self.prior_sd ** 2),
+                       self.recording, self.innovation, make_storage(0, 0, n), make_scratch(n))
+        squares = (self.innovation[:self.reading_start[count]] ** 2).sum(axis=1)
+        return float(np.log1p(squares / _JUDGED).sum())
+
+    def rank(self, candidates: np.ndarray) -> np.ndarray:
+        """Filter the beginning from each attitude (k, 4); return them, the most plausible first.
+
+        The beginning ends where the fixes have moved far beyond their noise, which is what
+        tells headings apart, but not before ``_BEGINNING``: a start at speed moves at once, and
+        only changes of velocity tell headings apart then.
+        """
+        sample = np.repeat(np.arange(len(self.x)), np.diff(self.reading_start))
+        of_fix = self.readings["kind"] == FIX
+        fixes = self.readings[of_fix]
+        apart = np.linalg.norm(fixes["value"] - fixes["value"][0], axis=1)
+        moved = np.flatnonzero(apart * fixes["whiten"][:, 0, 0] > _MOVED)
+        count = len(self.x) if not len(moved) else int(sample[of_fix][moved[0]]) + 1
+        stamp = self.imu.log.stamp
+        least = int(np.searchsorted(stamp, stamp[0] + _BEGINNING))
+        count = min(max(count, least), len(self.x))
+        scores = []
+        for quat in candidates:
+            self.mean[ATT:ATT + 4] = quat
+            scores.append(self.follow(count))
+        return candidates[np.argsort(scores, kind="stable")]
+
+    def from_attitude(self, quat: np.ndarray) -> "Problem":
+        """The same problem, not yet solved, with a first attitude (4,)."""
+        other = copy.copy(self)
+        other.mean = self.mean.copy()
+        other._start()
+        other.mean[ATT:ATT + 4] = quat
+        other.x[0] = other.mean
+        other.attach()
+        return other
+
+    def _surface_lever(self):
+        """Lever arm (3,) or (N, 3) m of the point that is held on the surface."""
+        i = self.blocks.surface_lever_arm
+        return self.params.surface.lever_arm if i < 0 else slow_states(self.x, i, 3)
+
+    def surface_points(self) -> np.ndarray:
+        """Points (N, 3) m of the trajectory that are held on the surface."""
+        return surface_points(self.x[:, POS:POS + 3], self.x[:, ATT:ATT + 4],
+                              self._surface_lever())
+
+    def _touch(self, events: JumpEvents | None) -> None:
+        """Evaluate the surface at the trajectory."""
+        self.contact_start, self.contacts = evaluate_constraints(
+            self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params)
+        lever = self._surface_lever()
+        if self.blocks.surface_lever_arm >= 0 or np.any(lever):
+            put_lever_derivatives(self.contact_start, self.contacts, self.x[:, ATT:ATT + 4], lever)
+        if self.blocks.body_height < 0:
+            self.contacts["residual"] -= np.where(
+                self.contacts["height"], self.params.surface.body_height, 0.0)
+
+    def step(self, events: JumpEvents | None, with_cov: bool = False) -> Change:
+        """One Gauss-Newton step; moves x, and notes the cost of the trajectory before it."""
+        n, total = self.size, len(self.x)
+        if self.constraints:
+            self._touch(events)
+        delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
+        boxminus(self.mean, self.x[0], delta)
+        prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
+        covariances = np.empty((total if with_cov else 0, 3, 3, 3))
+        variances = np.empty((total if with_cov else 0, n - SLOW))
+        cost, process, largest = solve_linear(self.x, delta, cov, self.recording, self.innovation,
+                                              covariances, variances)
+        self.cost.append(0.5 * (prior_cost + cost + self._process))
+        self._process = process
+        # A delay that runs away beyond belief takes the measurements with it.
+        for i in self.delays:
+            bound = _DELAY_SDS * self.prior_sd[i]
+            late = slow_states(self.x, i, 1)
+            np.clip(late, -bound, bound, out=late)
+        if with_cov:
+            sampled = np.append(np.arange(0, total - 1, THINNING), total - 1)
+            for column in variances.T:
+                column[:] = np.interp(np.arange(total), sampled, column[sampled])
+        return Change(largest, covariances, variances)
