@@ -30,8 +30,8 @@ class ReplayerParams(Parameters):
     rate: float = param(1.0, doc="speed as a multiple of the recorded pace; 0: as fast as our "
                         "nodes take it, nothing lost", low=0, read_only=False)
     foreign_rate: float = param(
-        1.0, doc="speed at rate 0 while nodes that are not ours subscribe: they cannot "
-        "acknowledge; 0: do not regard them", low=0)
+        1.0, doc="speed at rate 0 while nodes that are not ours subscribe: they drop what "
+        "their queues cannot hold; 0: do not regard them", low=0)
     start_offset: float = param(0.0, doc="skip this much of the recording", unit="s", low=0)
     duration: float | None = param(None, doc="play this much of the recording", unit="s", low=0)
     loop: bool = param(False, doc="start again at the end")
@@ -273,7 +273,7 @@ class Replayer(Node):
         elif p.rate == 0.0 and self._source.foreign and p.foreign_rate:
             names = sorted({n for names in self._source.foreign.values() for n in names})
             text = (f"playing at {p.foreign_rate:g} times the recorded pace, because nodes that "
-                    f"cannot acknowledge subscribe: {', '.join(names)}")
+                    f"may drop messages subscribe: {', '.join(names)}")
         if text and text != self._told:
             self.get_logger().info(text)
         self._told, self._told_at = text, sent
