@@ -396,6 +396,26 @@ def test_node_between_waits_for_sinks_that_only_its_source_has_discovered(graph)
     assert receiver.input.missed == 0 and not receiver.flow.problems
 
 
+def test_node_between_answers_anew_when_its_sender_has_discovered_more(graph):
+    """The receiver comes when the doubler has answered, and does not see it for a while. Were
+    they all sent now, the receiver had all of the numbers, and would leave before the doubler's."""
+    doubler = Doubler(graph)
+    sender = Sender(graph, wait_for=["doubler", "receiver"])
+    sender.session(100)
+    graph.until(lambda: sender.source.waiting_for() == "no answer yet from /receiver")
+    receiver, hidden = Receiver(graph, topic="/doubled"), [True]
+    names = receiver.node.get_topic_names_and_types
+    receiver.node.get_topic_names_and_types = lambda: [
+        (topic, types) for topic, types in names()
+        if not (hidden[0] and topic.startswith("/doubler" + MARK))]
+    graph.until(lambda: receiver.flow.sink.sessions
+                and sender.source.waiting_for() == "no answer yet from /doubler")
+    assert sender.out.sent == 0
+    hidden[0] = False
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == twice(100) and not receiver.flow.problems
+
+
 def test_best_effort_sink_listens_reliably_during_a_session_and_only_then(graph):
     """A driver that offers best effort is heard before and after; a replay loses nothing."""
     receiver = Receiver(graph, qos=sensor_qos())
@@ -455,7 +475,7 @@ def test_large_messages_are_bounded_by_their_bytes(graph, monkeypatch):
 def statement(instance, gid_of, topic="/numbers", event=BEGIN, session="forged"):
     """What a forger says of a session."""
     return State(True, Sending(session, event, {topic: Sent("std_msgs/msg/Int64", gid_of, 0, 0)},
-                               frozenset()), {}).message()
+                               frozenset(), 1), {}).message()
 
 
 @pytest.mark.parametrize("message", [
@@ -479,7 +499,7 @@ def test_malformed_states_are_ignored_with_a_warning(graph, monkeypatch, capfd, 
 
 @pytest.mark.parametrize("text", ["x", "1 2 3", "a b -1 0", "t w 1.5 0", ""])
 def test_malformed_fields_are_no_state(text):
-    message = State(True, Sending("s", BEGIN, {}, frozenset()), {}).message()
+    message = State(True, Sending("s", BEGIN, {}, frozenset(), 1), {}).message()
     message.status[0].values[0].key = "topic /x"
     message.status[0].values[0].value = text
     with pytest.raises(ValueError, match="malformed"):

@@ -55,7 +55,9 @@ class Flow:
         self.sink = Sink(
             node, self.peers, own, gid[:PARTICIPANT], hold=hold, on_begin=on_begin,
             on_join=self._join, gate=lambda: not relays or self.source.ready(),
-            may_answer=lambda: not relays or self.source.is_settled(), say=self._say,
+            may_answer=lambda: not relays or (
+                self.source.is_settled() and self.sink.company() <= self.source.company),
+            say=self._say,
             problem=self._problem)
         self._said: State | None = None
         self._poll = _POLL
@@ -120,7 +122,10 @@ class Flow:
 
     def _changed(self):
         self.sink.follow()
+        if self._relays:
+            self.source.look()  # those whom our senders know may be more
         self.source.advance()
+        self._say()
 
     def _look(self):
         self.peers.look()

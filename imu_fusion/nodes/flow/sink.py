@@ -34,7 +34,7 @@ class Session:
     said: Sending
     topics: dict[str, int]  # those taken -> count of the writer when we joined
     late: int = 0  # messages before that
-    answered: bool = False
+    answered: int = 0  # version of its company with which we are ready
     broken: bool = False
     finished: bool = False
 
@@ -189,12 +189,13 @@ class Sink:
     def joined(self) -> Mapping[str, Joined]:
         """What is said of the sessions.
 
-        One that feeds what this node sends is answered when that may be sent: its sender begins
-        when all behind this node are ready, too.
+        One that feeds what this node sends is answered when that may be sent, and to all whom
+        its sender knows: it begins when all behind this node are ready, too.
         """
         for session in self.sessions.values():
-            session.answered |= not session.topics or self._may_answer()
-        return {s.instance: Joined(s.id, s.finished, {
+            if not session.topics or self._may_answer():
+                session.answered = session.said.version
+        return {s.instance: Joined(s.id, s.answered, s.finished, {
             topic: Taken(self.inputs[topic].reader, base + self._reported.get(topic, 0),
                          self.inputs[topic].lost)
             for topic, base in s.topics.items()})

@@ -12,7 +12,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
 from imu_fusion.nodes.flow.peers import Peers
 from imu_fusion.nodes.flow.qos import full_name, gid, made, reliable_qos, type_name
-from imu_fusion.nodes.flow.state import BEGIN, END, Joined, Sending, Sent
+from imu_fusion.nodes.flow.state import BEGIN, END, MARK, Joined, Sending, Sent
 
 WINDOW = 500  # messages sent before all must be acknowledged; half the depth of the queue
 WINDOW_BYTES = 16e6
@@ -119,7 +119,8 @@ class Source:
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
         self._upstream, self._say, self._problem = upstream, say, problem
         self._session = ""
-        self._company: set[str] = set()
+        self.company: set[str] = set()  # instances that must have joined
+        self._version = 0
         self._takers: dict[str, tuple[str, Joined]] = {}  # instance -> name, what it said last
         self._event = ""  # with which the session is to end
         self._begin_after = False
@@ -137,7 +138,8 @@ class Source:
         return Sending(
             self._session, self._event if self.phase == _ENDED else BEGIN,
             {topic: Sent(type_name(o.msg_type), o.writer, o.start, o.sent)
-             for topic, o in self.outputs.items()}, frozenset(self._company), self.lost)
+             for topic, o in self.outputs.items()}, frozenset(self.company),
+            self._version, self.lost)
 
     def begin(self) -> None:
         """Announce a session, now or when the last one is over."""
@@ -145,7 +147,7 @@ class Source:
             self._begin_after = True
             return
         self._begin_after, self._event, self._session = False, "", uuid.uuid4().hex[:12]
-        self._company, self._takers, self.lost = set(), {}, 0
+        self.company, self._takers, self.lost = set(), {}, 0
         for output in self.outputs.values():
             output.start = output.sent
         self.phase = _JOINING
@@ -191,8 +193,7 @@ class Source:
         """Who keeps the source from sending or ending, in words; '' if nobody does."""
         if self.phase == _JOINING:
             names = {peer.name for peer in self._peers.values() if peer.is_silent}
-            names |= {instance.partition("/_flow/")[0]
-                      for instance, joined in self._answers().items() if joined is None}
+            names |= {instance.partition(MARK)[0] for instance in self._waiting()}
             names |= self._wait_for - self._names()
             return ("no answer yet from " + ", ".join(sorted(names)) if names
                     else "discovery is not complete")
@@ -214,14 +215,15 @@ class Source:
         if self.phase in (_JOINING, _OPEN):
             known = self._upstream() | {
                 p.instance for p in self._peers.values() if p.state and p.state.listens}
-            if anew or known - self._company:
-                self._company |= known
+            if anew or known - self.company:
+                self.company |= known
+                self._version += 1
                 self.phase = _JOINING
                 self._say()
         else:
-            known = self._company & self._peers.keys()
-        for instance in self._company - known:
-            self._company.discard(instance)
+            known = self.company & self._peers.keys()
+        for instance in self.company - known:
+            self.company.discard(instance)
             name, joined = self._takers.get(instance, ("", None))
             if (joined is not None and joined.topics and not joined.finished
                     and any(output.sent > output.start for output in self.outputs.values())):
@@ -265,26 +267,30 @@ class Source:
     def _answers(self):
         """What each of the company says of this session; None: nothing yet."""
         answers = {}
-        for instance in self._company:
+        for instance in self.company:
             peer = self._peers.get(instance)
             joined = peer.state.joined.get(self._own) if peer and peer.state else None
             answers[instance] = joined if joined and joined.session == self._session else None
         return answers
+
+    def _waiting(self):
+        """Those of the company that are not ready with the company as it is now."""
+        return {instance for instance, joined in self._answers().items()
+                if joined is None or joined.version < self._version and not joined.finished}
 
     def _names(self):
         return {self._peers[i].name for i, j in self._answers().items() if j is not None}
 
     def _all_joined(self):
         """All have answered, and the readers that they speak of are matched."""
-        answers = self._answers().values()
-        if (None in answers or self._wait_for - self._names()
+        if (self._waiting() or self._wait_for - self._names()
                 or any(peer.is_silent for peer in self._peers.values())
                 or any(time.monotonic() - since < GETTING_KNOWN
                        for since in self._foreign_since.values())):
             return False
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
-            if {j.topics[topic].reader for j in answers
+            if {j.topics[topic].reader for j in self._answers().values()
                     if topic in j.topics and not j.finished} - set(map(gid, infos)):
                 return False
             compatible = sum(qos_check_compatible(output.qos, i.qos_profile)[0]

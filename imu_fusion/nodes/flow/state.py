@@ -39,22 +39,24 @@ class Taken(NamedTuple):
 class Sending:
     """A session that a node sends; ``session`` is empty if none.
 
-    ``company``: the instances that must have joined; ``lost``: messages that its sender itself
-    lacks of what it makes these from.
+    ``company``: the instances that must have joined, ``version`` of this list; ``lost``: messages
+    that its sender itself lacks of what it makes these from.
     """
 
     session: str = ""
     event: str = ""
     topics: Mapping[str, Sent] = field(default_factory=dict)
     company: frozenset[str] = frozenset()
+    version: int = 0
     lost: int = 0
 
 
 @dataclass(frozen=True)
 class Joined:
-    """A session that a node has joined."""
+    """A session that a node has joined; ``version`` of the company with which it is ready."""
 
     session: str
+    version: int
     finished: bool
     topics: Mapping[str, Taken]
 
@@ -72,11 +74,13 @@ class State:
         """As a ROS message."""
         s = self.sending
         own = {"listens": str(int(self.listens)), "lost": str(s.lost),
-               "company": " ".join(sorted(s.company))}
+               "company": " ".join(sorted(s.company)), "version": str(s.version)}
         own |= {_TOPIC + topic: " ".join(map(str, sent)) for topic, sent in s.topics.items()}
         return DiagnosticArray(status=[_status("sends", s.event, s.session, own)] + [
             _status(sender, "finished" if j.finished else "joined", j.session,
-                    {topic: " ".join(map(str, taken)) for topic, taken in j.topics.items()})
+                    {"version": str(j.version)} | {
+                        _TOPIC + topic: " ".join(map(str, taken))
+                        for topic, taken in j.topics.items()})
             for sender, j in self.joined.items()])
 
     @classmethod
@@ -91,14 +95,15 @@ class State:
             values = {v.key: v.value for v in own.values}
             if own.name != "sends" or own.message not in ("", BEGIN, NEXT, END):
                 raise ValueError(f"event '{own.message}' of '{own.name}'")
-            topics = {key.removeprefix(_TOPIC): _sent(*value.split())
-                      for key, value in values.items() if key.startswith(_TOPIC)}
-            sending = Sending(own.hardware_id, own.message, topics,
-                              frozenset(values["company"].split()), _count(values["lost"]))
-            return cls(values["listens"] == "1", sending, {
-                s.name: Joined(s.hardware_id, s.message == "finished",
-                               {v.key: _taken(*v.value.split()) for v in s.values})
-                for s in others})
+            sending = Sending(own.hardware_id, own.message, _topics(values, _sent),
+                              frozenset(values["company"].split()), _count(values["version"]),
+                              _count(values["lost"]))
+            joined = {}
+            for status in others:
+                said = {v.key: v.value for v in status.values}
+                joined[status.name] = Joined(status.hardware_id, _count(said["version"]),
+                                             status.message == "finished", _topics(said, _taken))
+            return cls(values["listens"] == "1", sending, joined)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"malformed: {error!r}") from None
 
@@ -107,6 +112,11 @@ def _status(name, event, session, values):
     return DiagnosticStatus(
         name=name, message=event, hardware_id=session,
         values=[KeyValue(key=key, value=value) for key, value in values.items()])
+
+
+def _topics(values, read):
+    return {key.removeprefix(_TOPIC): read(*value.split())
+            for key, value in values.items() if key.startswith(_TOPIC)}
 
 
 def _count(text):
