@@ -6,8 +6,9 @@ READY := $(VENV)/.ready
 # A file per process at a time: its tests share fixtures, and a ROS domain of their own.
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-# Docstrings: imperative mood, Google sections without underlines, first sentences of two lines.
-PEP257 := --add-ignore D205 D209 D213 D400 D401 D403 D406 D407 D413 D415 D417
+# Docstrings: no imperative mood, Google sections without underlines, first sentences of two lines,
+# shapes in parentheses, indented examples.
+PEP257 := --add-ignore D205 D208 D402 D209 D213 D400 D401 D403 D406 D407 D413 D415 D417
 
 .PHONY: demo test test-slow test-all lint bench docs clean kernels
 

@@ -21,12 +21,18 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
+from imu_fusion.messages.convert import (
+    bool_message,
+    fix_message,
+    imu_message,
+    mag_message,
+    pose_message,
+    string_message,
+    velocity_message,
+)
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, STRING_TYPE, TWIST
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.messages.convert import (
-    bool_message, fix_message, imu_message, mag_message, pose_message, string_message,
-    velocity_message)
-from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, STRING_TYPE, TWIST
 from imu_fusion.simulation.jump_sensors import record
 from imu_fusion.simulation.ski_jump import SkiJump
 from imu_fusion.surfaces.file import load_surface

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother import Smoother
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import GnssErrors, PhoneErrors, record
-
 
 _ROW = np.dtype([("position", "f8", 3), ("velocity", "f8", 3), ("attitude", "f8", 3),
                  ("attitude_phone", "f8", 3), ("attitude_stated", "f8", 3), ("nees", "f8", 3),

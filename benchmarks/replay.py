@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.recordings.logs import read_log
 
 DURATION = 600  # s

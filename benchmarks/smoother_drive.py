@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.data import config, data_path
 from benchmarks.jumps import write
-from imu_fusion.evaluation.consistency import nees
 from imu_fusion.estimation.smoother import Smoother
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from benchmarks.data import config, data_path
 from benchmarks.jumps import write
 from imu_fusion.estimation.smoother import Smoother
-from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.estimation.smoother.measurements.gnss import even_stamps
+from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 

@@ -97,8 +97,7 @@ def _measure_node(seconds, queue):
     from rclpy.executors import SingleThreadedExecutor
     from std_srvs.srv import Trigger
 
-    from imu_fusion.messages.convert import (fix_message, imu_message, mag_message,
-                                             velocity_message)
+    from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
     from imu_fusion.nodes.smoother import SmootherNode
 
     def mib(who):

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.jumps import HEADER, monte_carlo, moved, write
-from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record

@@ -401,4 +401,3 @@ def _import_zeros(description, path):
     table.write_text("\n".join(",".join([str(row)] + ["0"] * (len(columns) - 1)) if row else
                                ",".join(columns) for row in range(4)))
     import_csv(table, path, path.with_name("table"), overwrite=True)
-

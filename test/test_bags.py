@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.evaluation.orientation_error import moving_at
-from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.messages.convert import string_value
+from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 
 ROOT = Path(__file__).resolve().parent.parent

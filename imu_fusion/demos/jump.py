@@ -9,6 +9,7 @@ from rich.table import Table
 
 from imu_fusion.demos.data import data_folder
 from imu_fusion.demos.trajectory import replay_and_smooth
+from imu_fusion.errors import EstimationError
 from imu_fusion.messages.convert import string_value
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
@@ -23,6 +24,8 @@ def show(out: Path, console: Console) -> None:
         ((_, _, _, cdr),) = reader.messages(["/reference/jump"])
         pose = read_log(reader, "reference/pose")
     found, truth = smoothed.result.jump, json.loads(string_value(cdr))
+    if found is None:
+        raise EstimationError("no jump was found in the recording of a jump")
     table = Table("quantity", "estimate", "truth", "error",
                   title="SIMULATED jump on Oberstdorf HS106: estimate against its truth")
     for name, unit, digits, estimate, true in (

@@ -2,8 +2,12 @@
 
 import numpy as np
 
-from imu_fusion.geometry.rotation import (quat_multiply, quat_rotate_inverse, quat_to_matrix,
-                                          quat_to_rpy)
+from imu_fusion.geometry.rotation import (
+    quat_multiply,
+    quat_rotate_inverse,
+    quat_to_matrix,
+    quat_to_rpy,
+)
 from imu_fusion.kernels import njit
 
 

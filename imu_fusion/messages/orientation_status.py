@@ -5,6 +5,8 @@ a person can read on the command line and a report can shade spans from. The gyr
 bias as a geometry_msgs/TwistWithCovarianceStamped.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imu_fusion.estimation.orientation import rows as st
@@ -26,7 +28,7 @@ _MAG_FLAGS = st.FLAG_MAG_DISTURBED | st.FLAG_MAG_SATURATED
 _MAG_SEEN = _MAG_FLAGS | st.FLAG_MAG_USED
 
 
-def lasting_flags(flags, before):
+def lasting_flags(flags: np.ndarray, before: int) -> np.ndarray:
     """The flags of rows that are in ``WORDS``; what a magnetometer sample showed lasts until the
     next one.
 
@@ -42,7 +44,7 @@ def lasting_flags(flags, before):
     return (flags | last & _MAG_FLAGS) & _LASTING
 
 
-def flags_message(stamp, frame_id, flags):
+def flags_message(stamp: int, frame_id: str, flags: int) -> bytes:
     """CDR bytes of a diagnostic_msgs/DiagnosticArray. stamp: int ns; flags: of WORDS."""
     words = [word for flag, word in WORDS.items() if flags & flag]
     return diagnostics_message(
@@ -51,7 +53,7 @@ def flags_message(stamp, frame_id, flags):
         bool(flags & _WORRIES), frame_id)
 
 
-def flags_value(cdr):
+def flags_value(cdr: bytes) -> tuple[int, int]:
     """(stamp int ns, flags) of a message of :func:`flags_message`.
 
     Raises:
@@ -61,7 +63,7 @@ def flags_value(cdr):
     return stamp, sum(flag for flag, word in WORDS.items() if values.get(word) == "True")
 
 
-def bias_message(row, frame_id):
+def bias_message(row: np.void, frame_id: str) -> bytes:
     """CDR bytes of the geometry_msgs/TwistWithCovarianceStamped with the gyroscope bias of one
     row as its angular part, rad/s in imu axes; the linear part is absent."""
     cov = np.zeros((6, 6))
@@ -70,7 +72,7 @@ def bias_message(row, frame_id):
     return TWIST.encode(row["stamp"], frame_id, [0.0, 0.0, 0.0, *row["gyr_bias"], *cov.ravel()])
 
 
-def bias_values(messages):
+def bias_values(messages: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stamps (n,) int64 ns, biases and standard deviations (n, 3) rad/s of bias messages."""
     stamp, _, values = TWIST.decode_many(messages)
     variance = np.diagonal(values[:, TWIST["covariance"]].reshape(-1, 6, 6), axis1=1, axis2=2)

@@ -25,7 +25,7 @@ _BESIDE = ("metadata.yaml", RESULTS_FILE, "report.html")
 class _Dumper(yaml.SafeDumper):
     """YAML without anchors: equal values are written out each time."""
 
-    def ignore_aliases(self, data):
+    def ignore_aliases(self, data: object) -> bool:
         return True
 
 

@@ -1,9 +1,12 @@
 """Sections about an acceleration field: its picture, rates, residuals, impacts."""
 
+from typing import Any
+
 import numpy as np
 import plotly.graph_objects as go
 
 from imu_fusion.report import figures as fig
+from imu_fusion.report.field_data import FieldData
 from imu_fusion.report.figures import Band, Line, Panel, time_figure
 from imu_fusion.report.html import Figure, Number, Numbers, Section, Table, Text
 from imu_fusion.report.overview import number
@@ -24,7 +27,7 @@ _METRICS = (
     ("gambit", "GAMBIT", 1.0, ""), ("damage", "DAMAGE", 1.0, ""))
 
 
-def field_sections(data, origin):
+def field_sections(data: FieldData, origin: int) -> list[Section]:
     """All sections about a field.
 
     Args:
@@ -86,7 +89,7 @@ def _field(data, time):
                linked=False)))
 
 
-def field_picture(data, time, magnitude):
+def field_picture(data: FieldData, time: np.ndarray, magnitude: np.ndarray) -> go.Figure:
     """Arrows at the accelerometers and query points, with a slider over time: a figure.
 
     Args:
@@ -155,8 +158,9 @@ def _rates(data, time, clipped):
             ("α", "rad/s²", rows["alpha"], rows["cov_alpha"], None)):
         sd = np.sqrt(np.maximum(np.einsum("nii->ni", cov), 0.0))
         for i, axis in enumerate("xyz"):
-            items = [Band("±1σ stated", time, values[:, i] - sd[:, i], values[:, i] + sd[:, i]),
-                     Line("estimate", time, values[:, i], fig.ESTIMATE)]
+            items: list[Any] = [
+                Band("±1σ stated", time, values[:, i] - sd[:, i], values[:, i] + sd[:, i]),
+                Line("estimate", time, values[:, i], fig.ESTIMATE)]
             if measured is not None:
                 items.append(Line("gyroscope as recorded", time, measured[:, i], fig.REFERENCE,
                                   dash="dot", width=1.1))

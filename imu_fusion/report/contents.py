@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,7 @@ class Contents:
     start: int
     duration_s: float
 
-    def log(self, topic: str | None):
+    def log(self, topic: str | None) -> Any:
         """The log of a topic, or None."""
         return self.logs.get(topic) if topic else None
 
@@ -104,7 +105,8 @@ def estimate_orientation(contents: Contents, params_file: str | Path | None = No
         return None, Status.from_messages((), ())
     stage, params = STAGES["orientation_estimator"].prepare(params_file)
     stream = stage.stream(*params)
-    stream.frame_ids = {topic: contents.logs[topic].frame_id for topic in stage.inputs
+    stream.frame_ids = {topic: getattr(contents.logs[topic], "frame_id", "")
+                        for topic in stage.inputs
                         if topic in contents.logs}
     made = stream.use(contents.samples(stage.inputs)) + stream.flush()
     cdrs = {topic: [cdr for part in made if part.topic == topic for cdr in part.cdrs]

@@ -1,12 +1,15 @@
 """What the report needs of an acceleration field: estimates and readings, read from recordings."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.acceleration_field.impact_metrics import measure_impacts
 from imu_fusion.estimation.acceleration_field.rows import ROW, SATURATED, field_at, rigid_gradient
+from imu_fusion.estimation.acceleration_field.sensor_array import AccelerometerParams
 from imu_fusion.messages.convert import attitude_log
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.recordings.bag_reader import find_topic, open_bag
@@ -37,25 +40,25 @@ class FieldData:
     impacts: list
 
     @property
-    def points(self):
+    def points(self) -> np.ndarray:
         """Query points (p, 3) m; the origin if none are named."""
         points = np.reshape(self.config.field.points, (-1, 3))
         return points if len(points) else np.zeros((1, 3))
 
     @property
-    def places(self):
+    def places(self) -> dict[str, np.ndarray]:
         """dict of accelerometer to its position (3,) m."""
         return {name: np.array(a.position) for name, a in self.config.accelerometers.items()}
 
-    def accelerometer(self, name):
+    def accelerometer(self, name: str) -> AccelerometerParams:
         """AccelerometerParams of one, completed by those of all."""
         return self.config.accelerometers[name].completed(self.config.field.sensor)
 
-    def field(self, points):
+    def field(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """(specific force, kinematic acceleration), each (n, p, 3) m/s^2 in body axes."""
         return field_at(self.rows, points, self.config.field.gravity)[:2]
 
-    def residuals(self, name):
+    def residuals(self, name: str) -> np.ndarray:
         """Readings of an accelerometer minus the estimated field, (n, 3) in its own axes."""
         sensor = self.accelerometer(name)
         force, kinematic = self.field([sensor.position])
@@ -65,7 +68,7 @@ class FieldData:
         return residual
 
     @property
-    def clipped(self):
+    def clipped(self) -> np.ndarray:
         """(n, 3) whether an axis of the gyroscope was taken to be at its limit."""
         sensor = self.config.field.sensor
         limit = sensor.gyro_range
@@ -76,7 +79,8 @@ class FieldData:
         return (own.astype(float) @ np.abs(axes)) > 0.5
 
 
-def read_field(bag, estimates, params_file=None):
+def read_field(bag: str | Path, estimates: str | Path,
+               params_file: str | Path | None = None) -> FieldData | None:
     """FieldData of a recording and of the one with its estimates; None if it holds none.
 
     Args:

@@ -1,19 +1,24 @@
 """Sections about orientation: angles, errors against a reference, field, rates, force."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.evaluation import orientation_error
+from imu_fusion.evaluation.orientation_error import OrientationErrors
 from imu_fusion.report import figures as fig
-from imu_fusion.report.figures import Band, Line, Panel, time_figure
+from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Figure, Number, Numbers, Section, Table, Text
 from imu_fusion.report.overview import number
-from imu_fusion.samples import seconds
+from imu_fusion.samples import AttitudeLog, ImuLog, PoseLog, seconds
 
 _MOVING = "in movement"
 
 
-def euler_zyx(quat_world_imu, cov_attitude=None):
+def euler_zyx(quat_world_imu: np.ndarray,
+              cov_attitude: np.ndarray | None = None) -> tuple[np.ndarray, Any]:
     """Roll, pitch, yaw (REP 103: yaw about up, then pitch about left, then roll about forward).
 
     Args:
@@ -47,7 +52,8 @@ def euler_zyx(quat_world_imu, cov_attitude=None):
     return angles, np.minimum(sd, np.pi)
 
 
-def angle_panels(estimate, origin, reference=None, reference_name="reference"):
+def angle_panels(estimate: AttitudeLog, origin: int, reference: PoseLog | None = None,
+                 reference_name: str = "reference") -> list[Panel]:
     """Panels of roll, pitch and yaw with their band, beside a reference.
 
     Args:
@@ -58,8 +64,9 @@ def angle_panels(estimate, origin, reference=None, reference_name="reference"):
     time = seconds(estimate.stamp, origin)
     angles, sd = (np.degrees(a) for a in euler_zyx(estimate.quat_world_imu,
                                                    estimate.cov_attitude))
-    has_reference = reference is not None and len(reference) > 0
-    if has_reference:
+    has_reference = False
+    if reference is not None and len(reference):
+        has_reference = True
         known = np.isfinite(reference.quat_world_imu).all(axis=1)
         ref_time = seconds(reference.stamp[known], origin)
         ref_angles = np.degrees(euler_zyx(reference.quat_world_imu[known])[0])
@@ -76,7 +83,7 @@ def angle_panels(estimate, origin, reference=None, reference_name="reference"):
     return panels
 
 
-def error_panels(errors, origin, word="error"):
+def error_panels(errors: OrientationErrors, origin: int, word: str = "error") -> list[Panel]:
     """Panels of the error rotation in world axes with the stated standard deviations.
 
     Args:
@@ -95,7 +102,8 @@ def error_panels(errors, origin, word="error"):
     return panels
 
 
-def orientation_section(estimate, origin, reference=None, reference_name="reference", shades=()):
+def orientation_section(estimate: AttitudeLog, origin: int, reference: PoseLog | None = None,
+                        reference_name: str = "reference", shades: Sequence[Shade] = ()) -> Section:
     """Section with roll, pitch and yaw of an estimate beside a reference.
 
     Args:
@@ -120,8 +128,9 @@ def orientation_section(estimate, origin, reference=None, reference_name="refere
                "errors are judged below without angles that can do that."),))
 
 
-def error_section(errors, origin, moving=None, reference_name="reference", is_truth=True,
-                  shades=()):
+def error_section(errors: OrientationErrors, origin: int, moving: np.ndarray | None = None,
+                  reference_name: str = "reference", is_truth: bool = True,
+                  shades: Sequence[Shade] = ()) -> Section:
     """Section with the errors against a reference and their statistics.
 
     Args:
@@ -136,16 +145,16 @@ def error_section(errors, origin, moving=None, reference_name="reference", is_tr
     for label, mask in ((_MOVING, moving), ("all samples", None)):
         if label == _MOVING and moving is None:
             continue
-        for row in orientation_error.statistics(errors, mask):
-            rows.append((label, row.name, number(row.rmse_deg, 2), number(row.median_deg, 2),
-                         number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count))
+        rows += [(label, row.name, number(row.rmse_deg, 2), number(row.median_deg, 2),
+                  number(row.p95_deg, 2), number(row.maximum_deg, 2), row.count)
+                 for row in orientation_error.statistics(errors, mask)]
     table = Table(("samples", f"{word} angle", "RMS °", "median °", "95 % below °", "largest °",
                    "count"), tuple(rows),
                   f"{word.capitalize()}s relative to {reference_name}. The {word} rotation "
-                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig et "
-                  "al. 2021) into a heading part about the vertical and an inclination part about a "
-                  "horizontal axis.")
-    blocks = [table]
+                  "(estimate times inverse reference, in the world) is split as in BROAD (Laidig "
+                  "et al. 2021) into a heading part about the vertical and an inclination part "
+                  "about a horizontal axis.")
+    blocks: list[Any] = [table]
     if is_truth:
         blocks += _honesty(errors, moving)
     panels = error_panels(errors, origin, word)
@@ -188,7 +197,8 @@ def _honesty(errors, moving):
                   f"{nees.mean():.2f}; 3 would be expected.")]
 
 
-def field_section(stamp, mag_world, origin, shades=()):
+def field_section(stamp: np.ndarray, mag_world: np.ndarray, origin: int,
+                  shades: Sequence[Shade] = ()) -> Section:
     """Section with the magnetic field carried into the world by the estimate.
 
     Args:
@@ -221,7 +231,8 @@ def field_section(stamp, mag_world, origin, shades=()):
                "steers by the field keeps them still.")))
 
 
-def motion_section(raw, corrected, origin, shades=()):
+def motion_section(raw: ImuLog, corrected: AttitudeLog, origin: int,
+                   shades: Sequence[Shade] = ()) -> Section:
     """Section with angular rates and specific force.
 
     Args:
@@ -248,16 +259,18 @@ def motion_section(raw, corrected, origin, shades=()):
         Figure(time_figure(panels, shades), " ".join(caption)),))
 
 
-def key_numbers(duration_s, imu_rate_hz, errors=None, moving=None, findings=0, is_truth=True):
+def key_numbers(duration_s: float, imu_rate_hz: float, errors: OrientationErrors | None = None,
+                moving: np.ndarray | None = None, findings: int = 0,
+                is_truth: bool = True) -> Numbers:
     """The numbers at the top of a report."""
     items = [Number("Duration", f"{duration_s:.1f} s"),
              Number("Imu", f"{number(imu_rate_hz, 1)} Hz", "mean rate")]
     if errors is not None:
         where = "moving" if moving is not None else "all samples"
         word = "error" if is_truth else "difference"
-        for row in orientation_error.statistics(errors, moving):
-            items.append(Number(f"{row.name.capitalize()} {word}", f"{number(row.rmse_deg, 2)}°",
-                                f"RMS, {where}"))
+        items += [Number(f"{row.name.capitalize()} {word}", f"{number(row.rmse_deg, 2)}°",
+                         f"RMS, {where}")
+                  for row in orientation_error.statistics(errors, moving)]
         shares = orientation_error.shares_within(errors, moving) if is_truth else {}
         for name, values in shares.items():
             if np.isfinite(values[0]):

@@ -1,6 +1,8 @@
 """What the orientation estimator said about itself: shaded spans, gyroscope bias."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -34,7 +36,7 @@ class Status:
     bias_sd: np.ndarray
 
     @classmethod
-    def from_messages(cls, flags, biases):
+    def from_messages(cls, flags: Sequence[bytes], biases: Sequence[bytes]) -> Self:
         """From CDR messages of imu/flags and imu/gyro_bias.
 
         Raises:
@@ -46,7 +48,7 @@ class Status:
         return cls(pairs[:, 0], pairs[:, 1], *values)
 
 
-def shades(status, origin, end, with_rest=True):
+def shades(status: Status, origin: int, end: int, with_rest: bool = True) -> list[Shade]:
     """Spans of the flags.
 
     Args:
@@ -69,7 +71,7 @@ def shades(status, origin, end, with_rest=True):
     return result
 
 
-def bias_section(status, origin, shades=()):
+def bias_section(status: Status, origin: int, shades: Sequence[Shade] = ()) -> Section:
     """Section with the gyroscope bias and its standard deviation."""
     time = seconds(status.bias_stamp, origin)
     bias, sd = np.degrees(status.bias), np.degrees(status.bias_sd)

@@ -17,7 +17,7 @@ from imu_fusion.report.html import Figure, Number, Section, Table, Text
 from imu_fusion.report.orientation import angle_panels
 from imu_fusion.report.overview import number
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
-from imu_fusion.samples import AttitudeLog, FixLog, VelocityLog, seconds
+from imu_fusion.samples import AttitudeLog, FixLog, PoseLog, VelocityLog, seconds
 from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
@@ -40,21 +40,21 @@ class Smoothed:
     origin: int
 
     @property
-    def time(self):
+    def time(self) -> np.ndarray:
         """(n,) s of the samples."""
         return seconds(self.result.samples["stamp"], self.origin)
 
-    def fixes_world(self):
+    def fixes_world(self) -> tuple[FixLog, np.ndarray]:
         """Valid fixes: FixLog and positions (m, 3) m."""
         fix = self.fix[valid_fixes(self.fix)]
         return fix, self.result.frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
 
-    def delay(self, *states):
+    def delay(self, *states: str) -> float:
         """ns by which stamps are late, as far as states of these names have found it."""
         return sum(int(round(float(self.result.states[name][0][0, 0]) * 1e9))
                    for name in states if name in self.result.states)
 
-    def antenna(self, stamp):
+    def antenna(self, stamp: np.ndarray) -> np.ndarray:
         """Position (m, 3) of the antenna at stamps of fixes, NaN outside of the samples."""
         samples, states = self.result.samples, self.result.states
         lever = states["gnss_lever_arm"][0] if "gnss_lever_arm" in states else \
@@ -64,14 +64,14 @@ class Smoothed:
         return interpolate(samples["stamp"], place, stamp - self.delay("gnss_time_offset"))
 
 
-def interpolate(stamp, columns, at):
+def interpolate(stamp: np.ndarray, columns: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Columns (n, k) at other stamps (m,), NaN outside."""
     since, at = stamp - stamp[0], at - stamp[0]
     return np.column_stack([np.interp(at, since, column, left=np.nan, right=np.nan)
                             for column in columns.T])
 
 
-def smoother_sections(smoothed, reference=None):
+def smoother_sections(smoothed: Smoothed, reference: PoseLog | None = None) -> list[Section]:
     """Sections about a smoothed trajectory.
 
     Args:
@@ -90,7 +90,7 @@ def smoother_sections(smoothed, reference=None):
     return sections
 
 
-def smoother_numbers(result):
+def smoother_numbers(result: SmootherResult) -> tuple[Number, ...]:
     """The key numbers of a result: a tuple of Number."""
     sd = np.sqrt(np.median(np.trace(result.samples["cov_position"], axis1=1, axis2=2)))
     state = {None: "single pass", True: "converged",

@@ -3,8 +3,10 @@
 import numpy as np
 import plotly.graph_objects as go
 
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.report import figures as fig
 from imu_fusion.report.decimate import POINTS
+from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
 # A flat trajectory is stretched upwards so that its height is at least this part of its extent.
@@ -14,7 +16,7 @@ _CELLS = 60
 _SIZE = 1.35  # of the longest side of the drawn box, in plotly's units
 
 
-def thinned(*columns):
+def thinned(*columns: np.ndarray) -> list[np.ndarray]:
     """Every k-th row of columns of the same length, at most POINTS."""
     step = -(-len(columns[0]) // POINTS)
     return [np.asarray(column)[::step] for column in columns]
@@ -25,7 +27,8 @@ def _speed_marks(speed, size, **bar):
         thickness=14, title=dict(text="speed in m/s", side="right", font=dict(size=13)), **bar))
 
 
-def space_figure(samples, time, fixes_world, surface):
+def space_figure(samples: np.ndarray, time: np.ndarray, fixes_world: np.ndarray,
+                 surface: Surface | None) -> go.Figure:
     """The trajectory in three dimensions, to be turned with the mouse.
 
     Args:
@@ -103,7 +106,7 @@ def _surface_meshes(surface, position_world):
             ends[1] = min(ends[1], 0.0)
         elif constraint.phase == "landing":
             ends[0] = max(ends[0], 0.0)
-        a, b = np.meshgrid(np.linspace(*ends, _CELLS), np.linspace(
+        a, b = np.meshgrid(np.linspace(ends[0], ends[1], _CELLS), np.linspace(
             low[1], high[1], 5 if is_hill else _CELLS))
         x, y = np.moveaxis(np.stack([a, b], axis=-1) @ turn, -1, 0)
         flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -111,7 +114,7 @@ def _surface_meshes(surface, position_world):
         yield x, y, -constraint.evaluate(flat)[0].reshape(x.shape)
 
 
-def map_figure(samples, fixes_world):
+def map_figure(samples: np.ndarray, fixes_world: np.ndarray) -> go.Figure:
     """Fixes and smoothed trajectory from above at one scale."""
     position, velocity = thinned(samples["position_world"], samples["vel_world"])
     (fixes,) = thinned(fixes_world)
@@ -131,14 +134,15 @@ def map_figure(samples, fixes_world):
     return figure
 
 
-def side_figure(hill, samples, fixes_world, events):
+def side_figure(hill: Hill, samples: np.ndarray, fixes_world: np.ndarray,
+                events: JumpEvents) -> go.Figure:
     """The long section of a jump: profile, fixes, smoothed trajectory, events; one scale."""
     x, _, z = hill.to_hill(samples["position_world"]).T
     x_fix, _, z_fix = hill.to_hill(fixes_world).T
     figure = go.Figure()
     for profile, ends in ((hill.in_run, (min(x.min(), 0.0), 0.0)),
                           (hill.landing, (0.0, max(x.max(), 0.0)))):
-        at = np.linspace(*ends, 400)
+        at = np.linspace(ends[0], ends[1], 400)
         figure.add_trace(go.Scatter(
             x=np.float32(at), y=np.float32(-profile(at)[0]), mode="lines", name="profile",
             legendgroup="profile", showlegend=profile is hill.in_run,

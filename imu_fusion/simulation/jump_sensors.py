@@ -1,5 +1,6 @@
 """What a phone and a GNSS logger record of a simulated jump."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_worl
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.simulation.noise_gnss import GnssErrors, gnss_errors
+from imu_fusion.simulation.ski_jump import SkiJump
 
 EPOCH = 1_529_400_000 * 10**9  # 2018-06-19, the summer of the paper's measurements
 _INSIDE = 10   # values in a sampling period, of which a reading is the mean
@@ -46,7 +48,7 @@ class Recording:
     mag_scale: np.ndarray
 
 
-def period_means(jump, times, period):
+def period_means(jump: SkiJump, times: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """What an inertial sensor reads: the means over its sampling periods.
 
     The filter of a real sensor leaves these; single values of a force that steps, as it does at
@@ -60,12 +62,14 @@ def period_means(jump, times, period):
     """
     inside = (np.arange(_INSIDE) + 0.5) / _INSIDE - 0.5
     motion = jump.at((times[:, None] + period * inside).ravel())
-    return [v.reshape(len(times), _INSIDE, 3).mean(axis=1)
-            for v in (jump.rate(motion), jump.specific_force(motion))]
+    rate, force = (v.reshape(len(times), _INSIDE, 3).mean(axis=1)
+                   for v in (jump.rate(motion), jump.specific_force(motion)))
+    return rate, force
 
 
-def record(jump, rng, phone=PhoneErrors(), gnss=GnssErrors(), gnss_rate=10.0, epoch=EPOCH,
-           outages=()):
+def record(jump: SkiJump, rng: np.random.Generator, phone: PhoneErrors = PhoneErrors(),
+           gnss: GnssErrors = GnssErrors(), gnss_rate: float = 10.0, epoch: int = EPOCH,
+           outages: Sequence[tuple[float, float]] = ()) -> Recording:
     """Record a :class:`~imu_fusion.simulation.ski_jump.SkiJump`.
 
     Args:

@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 from scipy.signal import lfilter
 
 from imu_fusion.errors import SampleError
 
 
-def ornstein_uhlenbeck(size, dt, beta, sigma, rng):
+def ornstein_uhlenbeck(size: int, dt: float, beta: float, sigma: float,
+                       rng: np.random.Generator) -> np.ndarray:
     """Stationary Ornstein-Uhlenbeck processes, sampled without discretisation error.
 
     The process of Rahaman 2019, eq. (4.1), ``d eta = -beta eta dt + sigma dW``, started from
@@ -38,7 +40,8 @@ def ornstein_uhlenbeck(size, dt, beta, sigma, rng):
     return lfilter([1.0], [1.0, -decay], drive, axis=0)
 
 
-def gauss_markov(size, dt, time_constant, sd, rng):
+def gauss_markov(size: int, dt: float, time_constant: float, sd: float,
+                 rng: np.random.Generator) -> np.ndarray:
     """First-order Gauss-Markov processes of stationary ``sd`` and correlation time, s.
 
     The same process as :func:`ornstein_uhlenbeck` in the terms of navigation. Returns an array

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_fusion.parameters.declare import Parameters, param
 
@@ -28,16 +29,17 @@ class GnssErrors(Parameters):
     time_offset: float = param(0.0, doc="The receiver's stamps are late by this", unit="s")
 
 
-def gauss_markov(times, sd, tau, rng):
+def gauss_markov(times: np.ndarray, sd: ArrayLike, tau: float,
+                 rng: np.random.Generator) -> np.ndarray:
     """Samples (n, k) of first-order Gauss-Markov errors at times (n,) s: stationary standard
     deviation sd (k,), correlation exp(-dt/tau)."""
-    sd = np.asarray(sd, dtype=float)
-    error = np.empty((len(times), len(sd)))
-    error[0] = sd * rng.standard_normal(len(sd))
+    each = np.asarray(sd, dtype=float)
+    error = np.empty((len(times), len(each)))
+    error[0] = each * rng.standard_normal(len(each))
     for i, dt in enumerate(np.diff(times)):
         keep = np.exp(-dt / tau)
         error[i + 1] = (keep * error[i]
-                        + sd * np.sqrt(1.0 - keep * keep) * rng.standard_normal(len(sd)))
+                        + each * np.sqrt(1.0 - keep * keep) * rng.standard_normal(len(each)))
     return error
 
 
@@ -50,7 +52,8 @@ def _errors(times, sd, tau, share, rng):
             + np.sqrt(1.0 - share) * sd * rng.standard_normal(white))
 
 
-def gnss_errors(times, errors, rng):
+def gnss_errors(times: np.ndarray, errors: GnssErrors,
+                rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Position (n, 3) and velocity (n, 3) errors at times (n,) s."""
     n = len(times)
     sd = np.array(errors.position_sd)

@@ -10,9 +10,10 @@ The paper does not print the mass, the step, or the height of the half-space. Th
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
@@ -79,26 +80,27 @@ class RigidMotion:
     gravity: float
 
     @property
-    def stamp(self):
+    def stamp(self) -> np.ndarray:
         """Stamps, int64 ns."""
         return np.round(self.t * 1e9).astype(np.int64)
 
-    def acceleration_body(self, point):
+    def acceleration_body(self, point: ArrayLike) -> np.ndarray:
         """Kinematic acceleration (n, 3) of a body point (3,), body axes (eq. B.13)."""
         point = np.asarray(point, dtype=float)
         return (self.acc_origin + np.cross(self.alpha, point)
                 + np.cross(self.omega, np.cross(self.omega, point)))
 
-    def acceleration_world(self, point):
+    def acceleration_world(self, point: ArrayLike) -> np.ndarray:
         """The same in world axes."""
         return _to_world(self.quat, self.acceleration_body(point))
 
-    def specific_force_body(self, point):
+    def specific_force_body(self, point: ArrayLike) -> np.ndarray:
         """What a real accelerometer at the point feels: kinematic acceleration minus gravity."""
         up = np.array([0.0, 0.0, self.gravity])
         return self.acceleration_body(point) + _to_body(self.quat, up)
 
-    def readings(self, positions, axes, reports="specific_force"):
+    def readings(self, positions: np.ndarray, axes: np.ndarray,
+                 reports: str = "specific_force") -> np.ndarray:
         """Noise-free readings (n, N, 3) of accelerometers (eq. B.14).
 
         Args:
@@ -126,7 +128,7 @@ def _to_body(quat, v):
     return out
 
 
-def contact_shape_factor(ratio):
+def contact_shape_factor(ratio: float) -> float:
     """``sqrt(D(k') / K(k')^3)`` of eq. (B.9) for the ratio of principal curvatures.
 
     Solves eq. (B.10) for the modulus. ``ratio`` is the smaller curvature over the larger one,
@@ -147,7 +149,7 @@ def contact_shape_factor(ratio):
     return float(np.sqrt(d / big_k ** 3))
 
 
-_TABLE = {}
+_TABLE: dict[str, Any] = {}
 
 
 def _shape_table():
@@ -230,7 +232,8 @@ def _integrate(n, every, h, r, v, q, w, body, out):
         w = (np.array(quat_rotate(quat_exp(turn, -1.0), momentum)) + 0.5 * h * torque) / inertia
 
 
-def simulate(scene=ImpactScene(), duration=1.0, step=1e-5, every=100):
+def simulate(scene: ImpactScene = ImpactScene(), duration: float = 1.0, step: float = 1e-5,
+             every: int = 100) -> RigidMotion:
     """Simulate the fall and its impacts.
 
     Args:

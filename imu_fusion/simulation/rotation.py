@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.samples.logs import ImuLog, MagLog, PoseLog
@@ -43,7 +44,7 @@ class Tumbling:
     quat_start: tuple | None = None
     waves: int = 6
 
-    def truth(self, t):
+    def truth(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Truth at times t (n,) s.
 
         Returns:
@@ -109,15 +110,18 @@ class Sensors:
     jitter: float = 0.0
 
 
-def earth_field(norm=48e-6, inclination=math.radians(63.0), declination=0.0):
+def earth_field(norm: float = 48e-6, inclination: float = math.radians(63.0),
+                declination: float = 0.0) -> np.ndarray:
     """Magnetic field in world axes (east, north, up), tesla; inclination positive down."""
     horizontal = norm * math.cos(inclination)
     return np.array([horizontal * math.sin(declination), horizontal * math.cos(declination),
                      -norm * math.sin(inclination)])
 
 
-def simulate(motion, duration, *, rate=200.0, mag_rate=None, sensors=Sensors(),
-             field_world=None, seed=0):
+def simulate(motion: Tumbling, duration: float, *, rate: float = 200.0,
+             mag_rate: float | None = None, sensors: Sensors = Sensors(),
+             field_world: ArrayLike | None = None,
+             seed: int = 0) -> tuple[ImuLog, MagLog, PoseLog, np.ndarray]:
     """Logs of an IMU and a magnetometer on a tumbling body.
 
     Args:

@@ -9,6 +9,7 @@ centimetres against the skis on the ground.
 
 import copy
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -126,7 +127,7 @@ class SkiJump:
 
         def edge(t, y):
             return y[0]
-        edge.terminal = True
+        edge.terminal = True  # type: ignore[attr-defined]
         run = solve_ivp(self._ground(hill.in_run, params.drag_in_run, None),
                         (self.t_start, self.t_start + 60.0), [params.start_x, 0.0],
                         events=edge, **options)
@@ -142,7 +143,7 @@ class SkiJump:
 
         def ground(t, y):
             return y[1] - hill.landing(y[0])[0] if t > self.t_takeoff + 0.3 else -1.0
-        ground.terminal, ground.direction = True, 1
+        ground.terminal, ground.direction = True, 1  # type: ignore[attr-defined]
         flight = solve_ivp(self._flight, (self.t_takeoff, self.t_takeoff + 20.0),
                            [x, z - rise, vx, slope * vx - rise_speed], events=ground, **options)
         if flight.status != 1:
@@ -242,7 +243,7 @@ class SkiJump:
             ground = _product(_fade(t - self.t_start), end) + _fade(t - self.t_touchdown)
         return np.stack([_product(ground, sway(t)) for sway in self._sways])
 
-    def shaken(self, rng):
+    def shaken(self, rng: np.random.Generator) -> Self:
         """The same jump with another random motion of the sensor against the skis."""
         other = copy.copy(self)
         other._sways = self._draw_sways(rng)
@@ -300,7 +301,7 @@ class SkiJump:
         return [(2, heading + turn[0], turn[1]), (1, *lean), (0, *roll),
                 (0, -spread[0], -spread[1]), (1, back[0] + np.pi / 2, back[1])]
 
-    def at(self, t):
+    def at(self, t: np.ndarray) -> Motion:
         """The :class:`Motion` at times t (n,) s since the beginning of the recording."""
         t = np.atleast_1d(np.asarray(t, dtype=float))
         wobble, sideways = self._wobble(t)
@@ -308,20 +309,21 @@ class SkiJump:
         w, air = 0.5, np.maximum(t - self.t_takeoff, 0.0)
         side = self.params.drift * np.stack([1.0 - np.cos(w * air), w * np.sin(w * air),
                                              w * w * np.cos(w * air) * (air > 0)]) + sideways
-        to_world = [self.hill.to_world(np.stack([a[0], s, a[1]], axis=1))
-                    for a, s in zip((pos, vel, acc), side)]
+        place, speed, push = (self.hill.to_world(np.stack([a[0], s, a[1]], axis=1))
+                              for a, s in zip((pos, vel, acc), side))
         mount = Rotation.from_rotvec(self.params.mount)
         arm, omega_arm = _turned(self._joints(t, pos[0], vel[0]))
-        return Motion(t, *to_world, (arm * mount).as_quat(), mount.inv().apply(omega_arm))
+        return Motion(t, place, speed, push, (arm * mount).as_quat(),
+                      mount.inv().apply(omega_arm))
 
-    def specific_force(self, motion):
+    def specific_force(self, motion: Motion) -> np.ndarray:
         """Specific force (n, 3) in sensor axes, m/s^2, on the turning Earth."""
         g = np.array([gravity_world(p, self.gravity) for p in motion.position_world])
         spin = earth_rate_world(self.hill.origin.latitude_deg)
         force = motion.acc_world - g + 2.0 * np.cross(spin, motion.vel_world)
         return Rotation.from_quat(motion.quat_world_imu).inv().apply(force)
 
-    def rate(self, motion):
+    def rate(self, motion: Motion) -> np.ndarray:
         """What an ideal gyroscope reads (n, 3), rad/s: the Earth's rotation included."""
         spin = earth_rate_world(self.hill.origin.latitude_deg)
         return motion.omega_imu + Rotation.from_quat(motion.quat_world_imu).inv().apply(spin)

@@ -1,6 +1,6 @@
 """The acceleration field estimator between its topics, live and in batch."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.parameters.file import node_values
 from imu_fusion.samples import AccelerometerLog, ImuLog
+from imu_fusion.samples.blocks import Samples
 from imu_fusion.samples.matching import SampleMatcher
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
@@ -77,7 +78,7 @@ def _gyr_values(values):
 
 ACCELEROMETER = SampleType(IMU, 3, _acc_values, AccelerometerLog)
 GYROSCOPE = SampleType(IMU, 3, _gyr_values,
-                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, None, frame))
+                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, frame_id=frame))
 
 
 @dataclass(frozen=True)
@@ -158,32 +159,33 @@ def messages(config: FieldConfiguration, rows: np.ndarray) -> list[Messages]:
 class AccelerationFieldStream(Stream):
     """See :class:`imu_fusion.streams.stream.Stream`; config: FieldConfiguration."""
 
-    def __init__(self, config, warn=lambda text: None):
+    def __init__(self, config: FieldConfiguration,
+                 warn: Callable[[str], object] = lambda text: None) -> None:
         self.config = config
         self.estimator = config.make_estimator()
         self._index = {topic: k for k, topic in enumerate(config.inputs)}
         super().__init__(config.inputs, warn)
 
-    def reset(self, session_topics=None):
-        self._impacts = []
+    def reset(self, session_topics: Container[str] | None = None) -> None:
+        self._impacts: list[dict[str, Any]] = []
         super().reset(session_topics)
 
-    def restart(self):
+    def restart(self) -> None:
         self.estimator.reset()
         self.matcher = self.config.make_matcher()
-        self._rows = []
+        self._rows: list[np.ndarray] = []
         self.saturated = self.missing = 0
         self.residual_rms = float("nan")
 
-    def use(self, samples):
+    def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         return self._give(*self.matcher.add_block(
             {self._index[topic]: part for topic, part in samples.items()}))
 
-    def flush(self):
+    def flush(self) -> list[Messages]:
         made = self._give(*self.matcher.flush_block())
         return made + self.smooth()
 
-    def smooth(self):
+    def smooth(self) -> list[Messages]:
         """Messages of what mode smoothed has held back."""
         try:
             made = self._write(self.estimator.finish())
@@ -195,7 +197,7 @@ class AccelerationFieldStream(Stream):
             self._rows = []
         return made
 
-    def conclude(self):
+    def conclude(self) -> Conclusion:
         """The metrics of impacts, where there are any."""
         if not self.config.stream.impact.detect:
             return Conclusion()
@@ -204,7 +206,7 @@ class AccelerationFieldStream(Stream):
             results={"impacts": self._impacts} if self._impacts else {},
             summary=f"{number} impacts above {self.config.stream.impact.trigger:g} m/s^2")
 
-    def summary(self):
+    def summary(self) -> dict[str, object]:
         """Values for diagnostics."""
         return {"condition number": f"{self.estimator.condition_number:.3g}",
                 "residual rms in units of noise": f"{self.residual_rms:.3g}",

@@ -1,7 +1,9 @@
 """The orientation estimator between its topics, live and in batch."""
 
 import math
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +29,8 @@ from imu_fusion.messages.orientation_status import (
 )
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import ImuLog, MagLog, checks
-from imu_fusion.samples.blocks import joined
-from imu_fusion.sensors.magnetometer_calibration import MagCalibrator
+from imu_fusion.samples.blocks import Samples, joined
+from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 
@@ -68,7 +70,7 @@ class OrientationOutputParams(Parameters):
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
     publish_tf: bool = param(False, doc="Also broadcast the orientation as the transform from "
-                                        "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
+                             "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
 
 
@@ -171,7 +173,7 @@ class _Writer:
         return rows
 
 
-def turn_to_true_north(params, stamp, sample):
+def turn_to_true_north(params: OrientationParams, stamp: int, sample: np.ndarray) -> float | None:
     """Turn (rad) from magnetic to true north at a fix, or None if there is nothing to do.
 
     Args:
@@ -189,7 +191,7 @@ def turn_to_true_north(params, stamp, sample):
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
-def warm_up(params):
+def warm_up(params: OrientationParams) -> None:
     """Compile, or load from the cache, what the first samples would otherwise wait for."""
     estimator = OrientationEstimator(params.replace(**{"alignment.duration": 0.05}))
     for i in range(20):
@@ -226,26 +228,27 @@ class OrientationStream(Stream):
 
     same_frame = (IMU_TOPIC, MAG_TOPIC)
 
-    def __init__(self, params=OrientationParams(), output=OrientationOutputParams(),
-                 warn=lambda text: None):
+    def __init__(self, params: OrientationParams = OrientationParams(),
+                 output: OrientationOutputParams = OrientationOutputParams(),
+                 warn: Callable[[str], object] = lambda text: None) -> None:
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator = MagCalibrator()
-        self._next_calibration = None
+        self._next_calibration: int | None = None
         super().__init__(INPUTS, warn)
 
-    def reset(self, session_topics=None):
+    def reset(self, session_topics: Container[str] | None = None) -> None:
         self._writer = _Writer(self.params, self.output)
         super().reset(session_topics)
 
-    def restart(self):
+    def restart(self) -> None:
         self.estimator.reset()
         self._writer.restart()
         self._knows_north = False
         self._has_force = False
-        self._kept = []
+        self._kept: list[tuple[Samples, Samples]] = []
 
-    def use(self, samples):
+    def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         imu = samples.get(IMU_TOPIC, _NO_IMU)
         mag = samples.get(MAG_TOPIC, _NO_MAG)
         if self.params.mode == "smoothed":
@@ -254,7 +257,7 @@ class OrientationStream(Stream):
             return []
         # What is published from the first fix on refers to true north.
         stamp, turn = self._first_north(*samples.get(FIX_TOPIC, _NO_FIX))
-        made = []
+        made: list[Messages] = []
         if stamp is not None:
             before = [np.searchsorted(stamps, stamp) for stamps, _ in (imu, mag)]
             made = self._run(*((s[:k], v[:k]) for (s, v), k in zip((imu, mag), before)))
@@ -262,23 +265,23 @@ class OrientationStream(Stream):
             self._writer.turn += turn
         return made + self._run(imu, mag)
 
-    def flush(self):
-        made = []
+    def flush(self) -> list[Messages]:
+        made: list[Messages] = []
         if self._kept:
             imu, mag = (joined(parts) for parts in zip(*self._kept))
             self._kept = []
             made = self._run(imu, mag)
         return made + self._write(self.estimator.finish())
 
-    def conclude(self):
+    def conclude(self) -> Conclusion:
         return Conclusion(results=self.estimator.summary())
 
-    def change(self, params):
+    def change(self, params: OrientationParams) -> None:
         """Go on with other values of parameters that may change at run time."""
         self.params = params
         self.estimator.set_params(params)
 
-    def set_heading(self, yaw):
+    def set_heading(self, yaw: float) -> None:
         """Call the present yaw ``yaw`` (rad, counter-clockwise from above).
 
         Raises:
@@ -289,7 +292,7 @@ class OrientationStream(Stream):
         self._writer.set_yaw(yaw)
         self._knows_north = True
 
-    def calibrate_magnetometer(self):
+    def calibrate_magnetometer(self) -> MagCalibration:
         """Calibrate from the samples since the start and start anew with the result.
 
         Returns:
@@ -307,7 +310,7 @@ class OrientationStream(Stream):
         self.restart()
         return calibration
 
-    def look_at(self, topic, logs):
+    def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
         if topic == IMU_TOPIC:
             found = checks.check_acceleration(logs[topic].acc, logs[topic].stamp, topic)
         elif topic == MAG_TOPIC:
@@ -365,7 +368,7 @@ class OrientationStream(Stream):
                 + self._writer.corrected(self.estimator.take_corrected(), frame_id))
 
 
-def findings(logs):
+def findings(logs: Mapping[str, Any]) -> list[str]:
     """What looks wrong with whole logs: texts.
 
     Args:

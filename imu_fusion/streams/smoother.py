@@ -6,9 +6,9 @@ end in :func:`smooth`, and so in the same messages.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import EstimationError, MessageError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
+from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_messages
 from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
@@ -97,17 +98,18 @@ class SmootherStream(Stream):
         warn: called with a text when something is wrong.
     """
 
-    def __init__(self, params=SmoothingParams(), limit=math.inf, warn=lambda text: None):
+    def __init__(self, params: SmoothingParams = SmoothingParams(), limit: float = math.inf,
+                 warn: Callable[[str], object] = lambda text: None) -> None:
         self.params = params
         self.limit = limit
         super().__init__(INPUTS, warn)
 
-    def restart(self):
+    def restart(self) -> None:
         self.dropped = 0
         self.bytes = 0
         self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
 
-    def use(self, samples):
+    def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         for topic, (stamp, values) in samples.items():
             size = 8 * (1 + INPUTS[topic].width)
             room = len(stamp) if math.isinf(self.limit) else min(
@@ -122,15 +124,15 @@ class SmootherStream(Stream):
                 self._collected[topic].append((stamp[:room].copy(), values[:room].copy()))
         return []
 
-    def flush(self):
+    def flush(self) -> list[Messages]:
         return []
 
-    def counts(self):
+    def counts(self) -> dict[str, int]:
         """dict of topic to number of samples held."""
         return {topic: sum(len(stamp) for stamp, _ in parts)
                 for topic, parts in self._collected.items()}
 
-    def logs(self):
+    def logs(self) -> dict[str, Any]:
         """A snapshot: dict of topic to log, topics without samples left out.
 
         Raises:
@@ -152,7 +154,7 @@ class SmootherStream(Stream):
         return {topic: INPUTS[topic].log(*parts[0], self.frame_ids[topic])
                 for topic, parts in self._collected.items() if parts}
 
-    def conclude(self):
+    def conclude(self) -> Conclusion:
         """What the samples of a whole recording make: the smoothed trajectory."""
         logs = self.logs()
         result = smooth(self.params, logs)
@@ -161,7 +163,7 @@ class SmootherStream(Stream):
                           outcome.numbers, outcome.summary, outcome.remarks)
 
 
-def smooth(params, logs):
+def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
     """Smooth collected samples.
 
     Args:
@@ -190,22 +192,23 @@ class Outcome:
     frame_id: str
 
     @classmethod
-    def of(cls, result, frame_id):
+    def of(cls, result: SmootherResult, frame_id: str) -> Self:
         """Of a SmootherResult."""
-        numbers = {"samples": len(result.samples), "iterations": result.iterations,
-                   "converged": result.converged, "cost": float(result.cost[-1]),
-                   "misfit": result.misfit()}
+        numbers: dict[str, Any] = {
+            "samples": len(result.samples), "iterations": result.iterations,
+            "converged": result.converged, "cost": float(result.cost[-1]),
+            "misfit": result.misfit()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()
         return cls(result.summary(), numbers, result.frame, frame_id)
 
     @property
-    def remarks(self):
+    def remarks(self) -> list[str]:
         """Texts on what makes the result doubtful."""
         return self.numbers["remarks"]
 
-    def message(self, stamp):
+    def message(self, stamp: int) -> bytes:
         """CDR bytes of the diagnostic_msgs/DiagnosticArray on smoother/results; values are JSON."""
         return diagnostics_message(
             stamp, "world", _NAME, self.summary,
@@ -213,7 +216,7 @@ class Outcome:
             bool(self.remarks), self.frame_id)
 
 
-def results_value(cdr):
+def results_value(cdr: bytes) -> dict[str, Any]:
     """The numbers (dict) of an Outcome in a message of smoother/results.
 
     Raises:
@@ -226,7 +229,7 @@ def results_value(cdr):
         raise MessageError(f"{RESULTS_TOPIC}: a value cannot be read as JSON ({error})") from None
 
 
-def messages(samples, outcome, path_rate):
+def messages(samples: np.ndarray, outcome: Outcome, path_rate: float) -> Iterator[list[Messages]]:
     """Yield lists of Messages of a SmootherResult, in order of stamps, the path and the results
     last.
 
@@ -306,7 +309,7 @@ def _path(samples, rate):
     return bytes(TYPES.serialize_cdr(path, PATH_TYPE))
 
 
-def findings(logs):
+def findings(logs: Mapping[str, Any]) -> list[str]:
     """What looks wrong with whole logs as recorded: texts."""
     found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC) + checks.check_fix(logs[FIX_TOPIC])
     if MAG_TOPIC in logs:

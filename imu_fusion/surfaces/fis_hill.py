@@ -14,8 +14,15 @@ import numpy as np
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.surfaces.profile import (Arc, Curve, Line, Polynomial, Profile, TiltedCubic,
-                                         TiltedParabola)
+from imu_fusion.surfaces.profile import (
+    Arc,
+    Curve,
+    Line,
+    Polynomial,
+    Profile,
+    TiltedCubic,
+    TiltedParabola,
+)
 
 #: The norm's w by the chord from the table edge to K, and what certificates may miss it by:
 #: known ones do by up to 0.6 %, and w is rounded to whole metres.

@@ -5,8 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import LayoutError
-from imu_fusion.surfaces.constraint import (DEFAULT_SIGMA, Constraint, Surface,
-                                            height_constraint, split_sigma)
+from imu_fusion.surfaces.constraint import (
+    DEFAULT_SIGMA,
+    Constraint,
+    Surface,
+    height_constraint,
+    split_sigma,
+)
 from imu_fusion.surfaces.values import number
 
 PARTS = ("plane",)

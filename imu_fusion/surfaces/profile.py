@@ -42,7 +42,7 @@ class Arc:
     angle: float
     radius: float
 
-    def at_angle(self, angle):
+    def at_angle(self, angle: float) -> tuple[float, float]:
         """The point (x, z) where the slope angle is ``angle``."""
         return (self.x0 + self.radius * (np.sin(self.angle) - np.sin(angle)),
                 self.z0 - self.radius * (np.cos(self.angle) - np.cos(angle)))
@@ -99,7 +99,7 @@ class TiltedParabola:
     c: float
     xi_start: float
 
-    def offset(self, xi):
+    def offset(self, xi: Any) -> tuple[Any, Any]:
         """Horizontal and upward coordinates of the point xi, from the vertex."""
         s, k = np.sin(self.tilt), np.cos(self.tilt)
         return xi * k - self.c * xi * xi * s, xi * s + self.c * xi * xi * k

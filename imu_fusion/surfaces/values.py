@@ -1,5 +1,6 @@
 """Numbers as users write them."""
 
+import contextlib
 import math
 import numbers
 import reprlib
@@ -24,10 +25,8 @@ def number(value: Any, name: str, unit: str, low: float = -math.inf, high: float
     """
     result = math.nan
     if isinstance(value, (numbers.Real, str)) and not isinstance(value, bool):
-        try:
+        with contextlib.suppress(ValueError, OverflowError):
             result = float(value)
-        except (ValueError, OverflowError):
-            pass
     if not math.isfinite(result):
         raise LayoutError(f"key '{name}': {reprlib.repr(value)} is not a finite number ({unit})")
     if not low <= result <= high:

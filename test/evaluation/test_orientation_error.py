@@ -6,8 +6,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from imu_fusion.errors import SampleError
 from imu_fusion.evaluation.orientation_error import (
-    GAUSSIAN_SHARES, moving_at, orientation_errors, quaternions_at, shares_within, split_angles,
-    statistics)
+    GAUSSIAN_SHARES,
+    moving_at,
+    orientation_errors,
+    quaternions_at,
+    shares_within,
+    split_angles,
+    statistics,
+)
 from imu_fusion.samples.logs import PoseLog
 
 DEG = np.pi / 180

@@ -10,8 +10,7 @@ from scipy.special import lpmv
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.geometry.geodesy import LocalFrame, hill_axes
 from imu_fusion.geometry.gravity import earth_rate_world, gravity_world, normal_gravity
-from imu_fusion.geometry.magnetic_field import (decimal_year, declination,
-                                                magnetic_field_world)
+from imu_fusion.geometry.magnetic_field import decimal_year, declination, magnetic_field_world
 
 
 def _ecef(latitude_deg, longitude_deg, height):

@@ -6,10 +6,16 @@ import pytest
 from imu_fusion.errors import MessageError
 from imu_fusion.estimation.orientation import rows as st
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+from imu_fusion.messages.orientation_status import (
+    WORDS,
+    bias_message,
+    bias_values,
+    flags_message,
+    flags_value,
+    lasting_flags,
+)
 from imu_fusion.streams import orientation as orientation_stream
 from imu_fusion.streams.stream import one_by_one
-from imu_fusion.messages.orientation_status import (
-    WORDS, bias_message, bias_values, flags_message, flags_value, lasting_flags)
 
 
 @pytest.mark.parametrize("flags", [0, *WORDS, sum(WORDS)])

@@ -7,13 +7,13 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.streams.acceleration_field import ACCEL_TOPIC, IMU_TOPIC
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import ACCEL, IMU
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.report.acceleration_field import field_picture, field_sections
 from imu_fusion.report.field_data import read_field
 from imu_fusion.report.recording import write_recording_report
+from imu_fusion.streams.acceleration_field import ACCEL_TOPIC, IMU_TOPIC
 from test.report.test_report import EVIL, START, Page
 
 G = 9.80665
@@ -65,7 +65,8 @@ def recording(tmp_path_factory):
                for name, place in PLACES.items()}
     sensors["b"]["axes"] = AXES_B.ravel().tolist()
     parameters = {"accelerometers": {"names": list(PLACES), **sensors},
-                  "use_gyro": True, "sensor": {"gyro_range": [LIMIT]}, "points": list(POINT), "sample_rate": 1000.0}
+                  "use_gyro": True, "sensor": {"gyro_range": [LIMIT]}, "points": list(POINT),
+                   "sample_rate": 1000.0}
     (folder / "p.yaml").write_text(yaml.safe_dump(
         {"acceleration_field_estimator": {"ros__parameters": parameters}}))
     return folder / "bag", folder / "p.yaml"

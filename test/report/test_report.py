@@ -12,16 +12,33 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError, TopicError
-from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.messages.convert import imu_message, mag_message, pose_message
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.report.figures import (
-    Band, Line, Panel, Shade, break_wraps, intervals, merged, time_figure)
-from imu_fusion.report.orientation_status import Status
-from imu_fusion.report.orientation_status import shades as status_shades
+    Band,
+    Line,
+    Panel,
+    Shade,
+    break_wraps,
+    intervals,
+    merged,
+    time_figure,
+)
 from imu_fusion.report.gnss import gnss_section
 from imu_fusion.report.html import (
-    Figure, Notes, Number, Numbers, Section, Table, Text, render_report, write_report)
+    Figure,
+    Notes,
+    Number,
+    Numbers,
+    Section,
+    Table,
+    Text,
+    render_report,
+    write_report,
+)
 from imu_fusion.report.orientation import euler_zyx
+from imu_fusion.report.orientation_status import Status
+from imu_fusion.report.orientation_status import shades as status_shades
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.samples import FixLog, VelocityLog
 

@@ -19,8 +19,8 @@ from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report import smoother as report
-from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.contents import read_contents, smooth_recording
+from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.smoother import Smoothed, interpolate, smoother_sections
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure

@@ -22,7 +22,9 @@ def test_order_of_arrival_does_not_matter_within_the_hold():
     random = np.random.default_rng(0)
     # Delays below 25: no sample comes more than the hold of 30 late.
     jumbled = sorted(samples, key=lambda x: x[1] + random.uniform(0, 25))
-    stamps = lambda rows: [(r.ravel().tolist()) for _, r in rows]
+
+    def stamps(rows):
+        return [r.ravel().tolist() for _, r in rows]
     matcher, rows = run(jumbled)
     assert stamps(rows) == stamps(run(samples)[1]) and len(rows) == 40
     assert matcher.late == matcher.duplicates == matcher.incomplete == 0

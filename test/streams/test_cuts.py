@@ -51,6 +51,7 @@ def recording():
     rng = np.random.default_rng(5)
     imu, mag, _, _ = simulate(Tumbling(seed=3), 8.0, rate=100.0, mag_rate=23.0, sensors=NOISY,
                               seed=4)
+
     def rows(log, make):
         return spoilt([(int(s), lambda stamp, i=i: make(stamp, i))
                        for i, s in enumerate(log.stamp.tolist())], rng)

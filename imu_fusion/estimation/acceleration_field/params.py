@@ -201,7 +201,7 @@ class AccelerationFieldParams(Parameters):
     iteration: Iteration = Iteration()
 
     def idle(self) -> dict[str, str]:
-        idle = {}
+        idle: dict[str, str] = {}
         if self.method != "rigid_body":
             why = f"with method '{self.method}' (rigid_body has it)"
             idle |= dict.fromkeys(

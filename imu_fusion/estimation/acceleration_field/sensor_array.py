@@ -211,10 +211,10 @@ def nine_accelerometer_package(arm: float, center: Sequence[float] = (0.0, 0.0, 
 
     ``common`` goes to each AccelerometerParams.
     """
-    center = np.asarray(center, dtype=float)
-    sensors = [AccelerometerParams(position=tuple(center), **common)]
+    middle = np.asarray(center, dtype=float)
+    sensors = [AccelerometerParams(position=tuple(middle), **common)]
     for axis in range(3):
         across = tuple(name for i, name in enumerate(AXIS_NAMES) if i != axis)
-        sensors.append(AccelerometerParams(position=tuple(center + arm * np.eye(3)[axis]),
+        sensors.append(AccelerometerParams(position=tuple(middle + arm * np.eye(3)[axis]),
                                            measured_axes=across, **common))
     return tuple(sensors)

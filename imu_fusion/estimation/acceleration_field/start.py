@@ -106,8 +106,8 @@ def is_still(params: AccelerationFieldParams, array: SensorArray, readings: np.n
 
 def normalized(quat: Sequence[float]) -> np.ndarray:
     """A quaternion (4,) scaled to unit length."""
-    quat = np.asarray(quat, dtype=float)
-    return quat / np.linalg.norm(quat)
+    values = np.asarray(quat, dtype=float)
+    return values / np.linalg.norm(values)
 
 
 def _level(up, quat):

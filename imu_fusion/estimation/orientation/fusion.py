@@ -21,6 +21,7 @@ from imu_fusion.estimation.orientation import (
     rotation_history,
 )
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.estimation.orientation.alignment import Alignment
 from imu_fusion.estimation.orientation.measurements import (
     back_in_range,
     bounded_motion,
@@ -59,7 +60,7 @@ _NO_BLOCK = np.zeros(1, es.PREDICTION)
 _NO_SUM = np.zeros(1, MAG_SUM)
 
 
-def initialise(state, par, alignment):
+def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None:
     """Start from an Alignment. state (1,): zeroed; par (1,): of kernel_parameters."""
     s, p, a = state[0], par[0], alignment
     s["gyro_bias"] = a.gyr_bias

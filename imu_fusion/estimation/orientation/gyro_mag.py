@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from imu_fusion.estimation.orientation import gyro_limit, imu_rejection, mag_queue, rotation_history
+from imu_fusion.estimation.orientation.alignment import Alignment
 from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
 from imu_fusion.estimation.orientation.rows import (
     FLAG_ALIGNING,
@@ -49,7 +50,7 @@ _DROPPED = 0.01
 _FIRST_DT = 1e-2           # s: step that stands in for the one before the first sample
 
 
-def initialise(state, alignment):
+def initialise(state: np.ndarray, alignment: Alignment) -> None:
     """Start from an Alignment. state (1,): zeroed."""
     s, printed = state[0], state[0]["printed"]
     s["gyro_bias"] = alignment.gyr_bias
@@ -57,7 +58,7 @@ def initialise(state, alignment):
     cov = printed["cov"]
     cov[:3, :3] = alignment.cov_attitude_world
     cov[3:6, 3:6] = np.eye(3) * alignment.gyr_bias_sd ** 2
-    if alignment.has_heading:
+    if alignment.field_world is not None:
         printed["field_world"] = alignment.field_world
         # The field was turned to world axes by the initial attitude and shares its error:
         # the residual [b]x dtheta + d is zero at the start.

@@ -8,13 +8,13 @@ exactly known states do no harm.
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.forward_filter import Storage
 from imu_fusion.estimation.smoother.motion import put_decay
 from imu_fusion.estimation.smoother.records import Recording, Scratch
 from imu_fusion.estimation.smoother.state import ATT, POS, SLOW, VEL
 from imu_fusion.estimation.smoother.transition import adjoint_rows, slow_noise
+from imu_fusion.kernels import njit
 
 #: Variances of the slow states are computed for every so many samples: they hardly change from one
 #: to the next.

@@ -16,14 +16,30 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.extended_rts_model import (
-    DA, DW, ENU_NED, Model, Q, R, SIZE, V, d_to_ned, rate_matrix, to_ned)
-from imu_fusion.estimation.smoother.initial import attitude_from_vectors
+    DA,
+    DW,
+    ENU_NED,
+    SIZE,
+    Model,
+    Q,
+    R,
+    V,
+    d_to_ned,
+    rate_matrix,
+    to_ned,
+)
 from imu_fusion.estimation.smoother.imu_input import ImuInput, prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.initial import attitude_from_vectors
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
 from imu_fusion.estimation.smoother.measurements.gnss_fix import required
-from imu_fusion.estimation.smoother.measurements.registry import (FIX, MAG, MEASUREMENTS, VELOCITY,
-                                                                  prepare_readings)
+from imu_fusion.estimation.smoother.measurements.registry import (
+    FIX,
+    MAG,
+    MEASUREMENTS,
+    VELOCITY,
+    prepare_readings,
+)
 from imu_fusion.estimation.smoother.measurements.surface_contact import holds
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult, reading_variances

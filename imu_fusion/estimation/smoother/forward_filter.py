@@ -8,15 +8,19 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.measurements.registry import predict
 from imu_fusion.estimation.smoother.measurements.surface_contact import put_row
 from imu_fusion.estimation.smoother.motion import carry, put_decay
 from imu_fusion.estimation.smoother.records import Recording, Scratch
 from imu_fusion.estimation.smoother.state import boxminus, boxplus, slow
-from imu_fusion.estimation.smoother.transition import (add_noise, propagate_cov, propagate_rows,
-                                                       put_spread)
+from imu_fusion.estimation.smoother.transition import (
+    add_noise,
+    propagate_cov,
+    propagate_rows,
+    put_spread,
+)
+from imu_fusion.kernels import njit
 
 
 class Storage(NamedTuple):

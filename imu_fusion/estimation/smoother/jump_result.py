@@ -33,7 +33,7 @@ class JumpResult:
     landing_speed: float
     landing_speed_sd: float
 
-    def to_mapping(self):
+    def to_mapping(self) -> dict[str, float]:
         """Names and values, for JSON."""
         return asdict(self)
 

@@ -6,12 +6,12 @@ operations, so they agree bit for bit.
 """
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.backward_pass import Adjoint, Smoothed, smooth_segment
 from imu_fusion.estimation.smoother.forward_filter import filter_segment, make_storage
 from imu_fusion.estimation.smoother.records import Recording, make_scratch
 from imu_fusion.estimation.smoother.transition import apply_step
+from imu_fusion.kernels import njit
 
 #: Samples kept at once by the pass back: with 21 states some 0.6 MB, within the cache of a core.
 SEGMENT = 128

@@ -7,14 +7,28 @@ the velocities by the trapezoidal rule, so its derivative needs no storage of it
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.records import INTERVAL
-from imu_fusion.estimation.smoother.state import (ACC_BIAS, ATT, GYR_BIAS, POS, SLOW, VEL,
-                                                  StateBlocks, attitude, slow)
+from imu_fusion.estimation.smoother.state import (
+    ACC_BIAS,
+    ATT,
+    GYR_BIAS,
+    POS,
+    SLOW,
+    VEL,
+    StateBlocks,
+    attitude,
+    slow,
+)
 from imu_fusion.geometry.gravity import gravity_world
-from imu_fusion.geometry.rotation import (quat_exp, quat_multiply, quat_normalize, quat_to_matrix,
-                                          right_jacobian)
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_to_matrix,
+    right_jacobian,
+)
+from imu_fusion.kernels import njit
 
 
 @njit

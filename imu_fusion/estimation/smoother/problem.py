@@ -13,11 +13,14 @@ from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.linear_solve import solve_linear
 from imu_fusion.estimation.smoother.measurements.registry import DELAYS, FIX, MEASUREMENTS
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
-    evaluate_constraints, put_lever_derivatives, surface_points)
+    evaluate_constraints,
+    put_lever_derivatives,
+    surface_points,
+)
 from imu_fusion.estimation.smoother.motion import columns_of, intervals_of
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import CONTACT, MODEL, Recording, make_scratch
-from imu_fusion.estimation.smoother.state import (ATT, POS, SLOW, StatePrior, boxminus, slow_states)
+from imu_fusion.estimation.smoother.state import ATT, POS, SLOW, StatePrior, boxminus, slow_states
 from imu_fusion.estimation.smoother.surroundings import Surroundings
 from imu_fusion.surfaces.constraint import Constraint
 

@@ -7,9 +7,9 @@ states included: :data:`.state.MOST` entries, of which the first n are in use.
 from typing import NamedTuple
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.state import MOST, StateBlocks
+from imu_fusion.kernels import njit
 
 #: Motion between two samples: s, mean rate (rad/s) and force (m/s^2), their variance densities.
 INTERVAL = np.dtype([("dt", "f8"), ("gyr", "f8", 3), ("acc", "f8", 3), ("gyr_noise", "f8", 3),

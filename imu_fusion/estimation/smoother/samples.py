@@ -5,8 +5,16 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother.problem import Change, Problem
 from imu_fusion.estimation.smoother.result import SAMPLE, reading_variances
-from imu_fusion.estimation.smoother.state import (ACC_BIAS, ATT, BLOCKS, GYR_BIAS, POS, SLOW, VEL,
-                                                  slow_states)
+from imu_fusion.estimation.smoother.state import (
+    ACC_BIAS,
+    ATT,
+    BLOCKS,
+    GYR_BIAS,
+    POS,
+    SLOW,
+    VEL,
+    slow_states,
+)
 from imu_fusion.geometry.gravity import gravity_world
 
 

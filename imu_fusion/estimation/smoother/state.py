@@ -13,9 +13,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
 from imu_fusion.estimation.smoother.params import SmootherParams
-from imu_fusion.geometry.rotation import (quat_conjugate, quat_exp, quat_log, quat_multiply,
-                                          quat_normalize)
+from imu_fusion.geometry.rotation import (
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_normalize,
+)
 from imu_fusion.kernels import njit
 
 #: First error index of what is always there, three entries each, and their number.
@@ -69,6 +75,7 @@ class Block:
     def width(self) -> int:
         """Number of error states."""
         return len(self.components)
+
 
 #: All optional blocks, in their order in the state. Magnetic ones are kept in microtesla, near one
 #: in size.

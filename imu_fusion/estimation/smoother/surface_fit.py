@@ -9,7 +9,10 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
-    evaluate_constraints, holds, surface_points)
+    evaluate_constraints,
+    holds,
+    surface_points,
+)
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.surfaces.constraint import Constraint
 

@@ -10,9 +10,9 @@ states only decay.
 import math
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.state import ATT, POS, SLOW, VEL, boxplus
+from imu_fusion.kernels import njit
 
 
 @njit

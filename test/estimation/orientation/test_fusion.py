@@ -216,7 +216,6 @@ def test_rates_and_jitter(rate, mag_rate, jitter):
     assert rmse_deg(OrientationEstimator().run(imu, mag), truth) < 1.2
 
 
-
 @pytest.mark.parametrize("rate", [20.0, 200.0, 1000.0])
 @pytest.mark.parametrize("limit", [1.5, 4.0])
 def test_start_in_motion_at_the_limit(rate, limit):

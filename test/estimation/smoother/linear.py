@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_fusion.estimation.smoother import motion, state, transition
 from imu_fusion.estimation.smoother.records import INTERVAL, MODEL, ROWS, STEP
-from imu_fusion.estimation.smoother.state import ATT, place_blocks, StateBlocks
+from imu_fusion.estimation.smoother.state import ATT, StateBlocks, place_blocks
 
 BLOCKS, SIZE = place_blocks(StateBlocks._fields)
 SPIN = np.array([0.0, 5e-5, 5e-5])

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.smoother.jump_events import (JumpEvents, detect_jump, impact_onset,
-                                                        table_crossing)
-from imu_fusion.estimation.smoother.jump_result import jump_result
 from imu_fusion.estimation.smoother import SAMPLE
+from imu_fusion.estimation.smoother.jump_events import (
+    JumpEvents,
+    detect_jump,
+    impact_onset,
+    table_crossing,
+)
+from imu_fusion.estimation.smoother.jump_result import jump_result
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, record
 from imu_fusion.simulation.ski_jump import SkiJump

@@ -6,13 +6,35 @@ from imu_fusion.estimation.smoother.backward_pass import Adjoint, Smoothed, smoo
 from imu_fusion.estimation.smoother.forward_filter import filter_segment, make_storage
 from imu_fusion.estimation.smoother.linear_solve import SEGMENT, solve_linear
 from imu_fusion.estimation.smoother.measurements import registry
-from imu_fusion.estimation.smoother.records import (CONTACT, INTERVAL, MODEL, READING, Recording,
-                                                    make_scratch)
-from imu_fusion.estimation.smoother.state import (ACC_BIAS, ATT, POS, SLOW, VEL, boxminus, boxplus,
-                                                  place_blocks, slow_states)
+from imu_fusion.estimation.smoother.records import (
+    CONTACT,
+    INTERVAL,
+    MODEL,
+    READING,
+    Recording,
+    make_scratch,
+)
+from imu_fusion.estimation.smoother.state import (
+    ACC_BIAS,
+    ATT,
+    POS,
+    SLOW,
+    VEL,
+    boxminus,
+    boxplus,
+    place_blocks,
+    slow_states,
+)
 from imu_fusion.estimation.smoother.transition import apply_step
-from test.estimation.smoother.linear import (BLOCKS, SIZE, carried, model_of_all, random_state,
-                                             rows_of, transition_matrix)
+from test.estimation.smoother.linear import (
+    BLOCKS,
+    SIZE,
+    carried,
+    model_of_all,
+    random_state,
+    rows_of,
+    transition_matrix,
+)
 
 DT = 0.02
 FIELD = np.array([1.0, 20.0, -43.0])

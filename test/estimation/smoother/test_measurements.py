@@ -7,12 +7,24 @@ import pytest
 from imu_fusion.estimation.smoother import motion, transition
 from imu_fusion.estimation.smoother.measurements import registry
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
-    put_lever_derivatives, put_row, surface_points)
+    put_lever_derivatives,
+    put_row,
+    surface_points,
+)
 from imu_fusion.estimation.smoother.records import CONTACT
 from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, POS, SLOW, boxminus, slow_states
 from imu_fusion.geometry.rotation import skew
-from test.estimation.smoother.linear import (BLOCKS, SIZE, carried, interval_of, model_of_all,
-                                             perturbed, random_state, rows_of, transition_matrix)
+from test.estimation.smoother.linear import (
+    BLOCKS,
+    SIZE,
+    carried,
+    interval_of,
+    model_of_all,
+    perturbed,
+    random_state,
+    rows_of,
+    transition_matrix,
+)
 
 STEP = 1e-5   # of the central differences
 FIELD = np.array([1.0, 20.0, -43.0])

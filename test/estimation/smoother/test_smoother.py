@@ -7,14 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.smoother.jump_events import JumpEvents, detect_jump, find_jump
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.jump_events import JumpEvents, detect_jump, find_jump
 from imu_fusion.estimation.smoother.measurements.gnss import even_stamps, spaced
 from imu_fusion.estimation.smoother.params import Gnss, Iteration, Jump, Sensor
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
-from imu_fusion.simulation.jump_sensors import (
-    EPOCH, GnssErrors, PhoneErrors, period_means, record)
+from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, period_means, record
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
 from imu_fusion.surfaces.file import load_surface
 from test.estimation.smoother.jump_checks import BOUNDS, check

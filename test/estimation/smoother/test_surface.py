@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks.jumps import moved
 from imu_fusion.errors import EstimationError, ParameterError
-from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.measurements.surface_contact import evaluate_constraints
 from imu_fusion.estimation.smoother.params import Gnss, SurfaceContact
 from imu_fusion.estimation.smoother.result import SAMPLE
@@ -16,8 +16,8 @@ from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, record
 from imu_fusion.simulation.ski_jump import FASTEST_WOBBLE
-from imu_fusion.surfaces.file import load_surface, surface_from_mapping
 from imu_fusion.surfaces.constraint import Surface, height_constraint
+from imu_fusion.surfaces.file import load_surface, surface_from_mapping
 
 
 def test_unknown_height_of_the_sensor(jump):
@@ -34,8 +34,8 @@ def test_unknown_height_of_the_sensor(jump):
     # Given, it counts as well as found.
     given = Smoother(SmootherParams(surface=SurfaceContact(body_height=1.0)), believed).run(
         rec.imu, rec.mag, rec.fix, rec.velocity)
-    up = [np.median((low.to_geodetic(s.samples["position_world"])[2] - jump.hill.origin.to_geodetic(
-        rec.motion.position_world)[2])) for s in (given, r)]
+    up = [np.median(low.to_geodetic(s.samples["position_world"])[2] - jump.hill.origin.to_geodetic(
+        rec.motion.position_world)[2]) for s in (given, r)]
     assert np.abs(up).max() < 0.05 and given.remarks() == []
 
 

@@ -1,11 +1,11 @@
 """What fixes and velocities of a receiver have in common: stamps, covariances, an antenna."""
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.errors import SampleError
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.state import GYR_BIAS, slow
+from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import FixLog, VelocityLog
 
 # Stamps are predicted from the line so far, which a single stamp may move by this share of its

@@ -1,16 +1,19 @@
 """A fix: where the antenna was. p + R l + wandering error, at its stamp less the delay."""
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.measurements.gnss import chosen, put_gyr_scale, roots, vector
-from imu_fusion.estimation.smoother.measurements.measurement import (Measurement, Readings,
-                                                                     squared_scale)
+from imu_fusion.estimation.smoother.measurements.measurement import (
+    Measurement,
+    Readings,
+    squared_scale,
+)
 from imu_fusion.estimation.smoother.motion import cross, put_cross_matrix
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, POS, VEL, slow
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import FixLog
 
 
@@ -79,6 +82,7 @@ def predict(x, tau, step, model, rows):
         for i in range(3):
             for j in range(3):
                 h[i, blocks.gnss_lever_arm + j] += rotation[i, j]
+
 
 MEASUREMENT = Measurement(
     "fix", "position", ("east", "north", "up"), prepare,

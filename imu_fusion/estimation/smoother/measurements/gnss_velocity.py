@@ -2,15 +2,18 @@
 the delays."""
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.measurements.gnss import chosen, put_gyr_scale, roots, vector
-from imu_fusion.estimation.smoother.measurements.measurement import (Measurement, Readings,
-                                                                     squared_scale)
+from imu_fusion.estimation.smoother.measurements.measurement import (
+    Measurement,
+    Readings,
+    squared_scale,
+)
 from imu_fusion.estimation.smoother.motion import cross, put_cross_matrix
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, VEL, slow
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import VelocityLog
 
 
@@ -55,6 +58,7 @@ def predict(x, tau, step, model, rows):
                 h[i, delay] = -acc_world[i]
     if blocks.gnss_lever_arm >= 0:
         put_cross_matrix(rotation, rate, 1.0, h, blocks.gnss_lever_arm)
+
 
 MEASUREMENT = Measurement(
     "velocity", "velocity", ("east", "north", "up"), prepare,

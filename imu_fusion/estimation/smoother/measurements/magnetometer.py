@@ -1,14 +1,17 @@
 """A magnetometer sample: the field of the Earth in the axes of the sensor, scaled and biased."""
 
 import numpy as np
-from imu_fusion.kernels import njit
 
-from imu_fusion.estimation.smoother.measurements.measurement import (Measurement, Readings,
-                                                                     squared_scale)
+from imu_fusion.estimation.smoother.measurements.measurement import (
+    Measurement,
+    Readings,
+    squared_scale,
+)
 from imu_fusion.estimation.smoother.motion import cross
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.state import ATT, slow
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import MagLog
 
 #: Magnetic states and rows are kept in microtesla, near one in size.
@@ -63,6 +66,7 @@ def _field(rotation, field_world):
             + rotation[2, 1] * field_world[2],
             rotation[0, 2] * field_world[0] + rotation[1, 2] * field_world[1]
             + rotation[2, 2] * field_world[2])
+
 
 MEASUREMENT = Measurement(
     "mag", "magnetic field", ("x", "y", "z"), prepare,

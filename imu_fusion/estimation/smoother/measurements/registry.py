@@ -1,12 +1,12 @@
 """All measurements of the smoother: the one place that lists them."""
 
 import numpy as np
-from imu_fusion.kernels import njit
 
 from imu_fusion.estimation.smoother.measurements import gnss_fix, gnss_velocity, magnetometer
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import READING
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import Log
 
 #: Kinds of readings are indices into this.

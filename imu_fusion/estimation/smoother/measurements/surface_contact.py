@@ -7,13 +7,13 @@ linear solution: surfaces are Python (grids, splines). The kernel adds the heigh
 from collections.abc import Sequence
 
 import numpy as np
-from imu_fusion.kernels import njit
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import CONTACT
 from imu_fusion.estimation.smoother.state import ATT, POS, slow
+from imu_fusion.kernels import njit
 from imu_fusion.surfaces.constraint import Constraint
 
 
