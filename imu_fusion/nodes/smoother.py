@@ -5,6 +5,7 @@ import multiprocessing
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -138,7 +139,7 @@ class SmootherNode(Node):
         self.create_service(Trigger, "~/clear", self._on_clear)
         self.start_diagnostics("collection", self._status)
 
-    def work(self):
+    def work(self) -> float:
         """One turn: take all that waits, smooth, publish. See :meth:`Node.work`."""
         self._flow.send()
         turn = self._flow.take()
@@ -154,7 +155,7 @@ class SmootherNode(Node):
             return 0.0
         return 0.0 if self._publish() else self._flow.pause(IDLE)
 
-    def close(self):
+    def close(self) -> None:
         """End the child, if there is one."""
         self._flow.close()
         if self._child is not None:
@@ -231,7 +232,7 @@ class SmootherNode(Node):
 
     def _status(self):
         stream = self._stream
-        values = {f"{topic} collected": n for topic, n in stream.counts().items()}
+        values: dict[str, float] = {f"{topic} collected": n for topic, n in stream.counts().items()}
         values |= {f"{topic} {why}": n for topic in stream.inputs
                    for why, n in stream.refused(topic).items()}
         values |= {"megabytes": round(stream.bytes / 1e6, 1), "dropped": stream.dropped}
@@ -244,6 +245,6 @@ class SmootherNode(Node):
         return DiagnosticStatus.OK, "collecting", values
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(SmootherNode, args)

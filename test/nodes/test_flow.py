@@ -399,7 +399,7 @@ def test_node_between_waits_for_sinks_that_only_its_source_has_discovered(graph)
 def test_node_between_answers_anew_when_its_sender_has_discovered_more(graph):
     """The receiver comes when the doubler has answered, and does not see it for a while. Were
     they all sent now, the receiver had all of the numbers, and would leave before the doubler's."""
-    doubler = Doubler(graph)
+    Doubler(graph)
     sender = Sender(graph, wait_for=["doubler", "receiver"])
     sender.session(100)
     graph.until(lambda: sender.source.waiting_for() == "no answer yet from /receiver")
@@ -520,6 +520,8 @@ def test_who_does_not_publish_the_data_is_not_believed(graph, monkeypatch, capfd
     graph.until(lambda: receiver.ended and sender.source.drained())
     assert receiver.values == list(range(1000)) and len(receiver.ended) == 1
     assert not receiver.flow.problems
+    graph.until(lambda: all(peer.complained for peer in sender.flow.peers.values()
+                            if peer.name == "/forger"))
     assert "is ignored: does not publish /numbers" in capfd.readouterr().err
 
 

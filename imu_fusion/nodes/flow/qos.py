@@ -7,6 +7,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 E = TypeVar("E")
 
@@ -41,12 +42,12 @@ def type_name(msg_type: type) -> str:
     return f"{msg_type.__module__.split('.')[0]}/msg/{msg_type.__name__}"
 
 
-def full_name(info) -> str:
+def full_name(info: TopicEndpointInfo) -> str:
     """Name of the node of an endpoint."""
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
-def gid(info) -> str:
+def gid(info: TopicEndpointInfo) -> str:
     """Identity of an endpoint; its first :data:`PARTICIPANT` characters are of its process."""
     return bytes(info.endpoint_gid).hex()
 

@@ -4,6 +4,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Collection
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -48,7 +49,7 @@ class Output:
         self.sent = self.start = self.bytes = 0
         self._flight = self._flight_bytes = 0
 
-    def publish(self, message) -> None:
+    def publish(self, message: Any) -> None:
         """Send a message (or its CDR bytes) now, or as soon as it may leave."""
         if self.waiting or not self.is_open():
             self.waiting.append(message)
