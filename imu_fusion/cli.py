@@ -173,11 +173,12 @@ def info(bag: str, target: str | None) -> None:
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
     from imu_fusion.recordings.bag_reader import open_bag
     from imu_fusion.recordings.inspect import inspect_topics
+    from imu_fusion.recordings.losses import read_losses
     from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
-        for warning in reader.warnings:
+        for warning in [*reader.warnings, *read_losses(reader)]:
             click.echo(f"warning: {warning}")
         rows = inspect_topics(reader)
         click.echo(f"{'topic':<32} {'type':<44} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")

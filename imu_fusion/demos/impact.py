@@ -29,7 +29,7 @@ def show(out: Path, console: Console) -> None:
         nodes.start("replayer", show=True, bag=str(bag), rate=0.0,
                     wait_for_nodes=("recorder", "acceleration_field_estimator"))
         nodes.wait("replayer", 300)
-        nodes.finish("recorder", 30.0)
+        nodes.wait("recorder", 60)
     values = load(preset)["acceleration_field_estimator"]
     (limit,) = values["sensor"]["gyro_range"]
     preset_smoothed = out / "smoothed.yaml"

@@ -32,7 +32,7 @@ def show(out: Path, console: Console) -> None:
         nodes.start("replayer", show=True, bag=str(bag), rate=0.0,
                     wait_for_nodes=("recorder", "orientation_estimator"))
         nodes.wait("replayer", 300)
-        nodes.finish("recorder", 30.0)
+        nodes.wait("recorder", 60)
     elapsed = time.monotonic() - started
 
     with open_bag(bag) as played, open_bag(recording) as recorded:

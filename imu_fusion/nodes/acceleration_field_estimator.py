@@ -1,5 +1,7 @@
 """The acceleration field estimator as a node: decode, one call, encode."""
 
+from collections.abc import Sequence
+
 from std_srvs.srv import Trigger
 
 from imu_fusion.nodes.base import run_node
@@ -31,7 +33,7 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/smooth", self._on_smooth)
 
-    def summary(self):
+    def summary(self) -> dict:
         return self._stream.summary()
 
     def _on_reset(self, request, response):
@@ -53,6 +55,6 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
         return response
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(AccelerationFieldEstimatorNode, args)

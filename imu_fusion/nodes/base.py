@@ -89,6 +89,7 @@ class Node(rclpy.node.Node):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
                          **kwargs)
         self.finished = False
+        self.problems: list[str] = []  # texts: why the exit code is 1
         self._params = self._declare(params_files)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -215,8 +216,7 @@ def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
         use_fast_heartbeats()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
-        _run(node_class, signals, files)
-        return 0
+        return _run(node_class, signals, files)
     except KeyboardInterrupt:
         return 0
     except ImuFusionError as error:
@@ -258,6 +258,7 @@ def _run(node_class, signals, params_files):
         finally:
             executor.shutdown()
             node.destroy_node()
+    return 1 if node.problems else 0
 
 
 def usage(node_class: type[Node]) -> str:

@@ -1,5 +1,6 @@
 """What the nodes of all streaming estimators share: a Stream between DDS topics."""
 
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -7,72 +8,77 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.nodes.base import Node, message_class
-from imu_fusion.nodes.flow import Relay, reliable_qos, sensor_qos
+from imu_fusion.nodes.base import IDLE, Node, message_class
+from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
-from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream, one_by_one
+from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream
+
+_FAREWELL = 2.0  # s, in which a node that was asked to stop ends its session
 
 
 class EstimatorNode(Node):
-    """A node around a :class:`imu_fusion.streams.stream.Stream`; also the relay's processor."""
+    """A node around a :class:`imu_fusion.streams.stream.Stream`."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         self._announcing = ExitStack()
         self._announcing.enter_context(announced_compiling(self.get_logger().info))
+        self._deadline: float | None = None  # of an end that was asked for
 
     def close(self) -> None:
+        self._flow.close()
         self._announcing.close()
         super().close()
 
     def attach(self, stream: Stream, outputs: Mapping[str, str]) -> None:
         """Subscribe to the stream's inputs and advertise ``outputs`` (topic to type name)."""
         self._stream: Any = stream  # of the kind that the subclass has made
-        self._relay = Relay(self, self)
-        self._outputs = {topic: self._relay.publisher(message_class(msgtype), topic)
+        self._flow = Flow(self, relays=True)
+        self.problems = self._flow.problems
+        self._outputs = {topic: self._flow.output(message_class(msgtype), topic)
                          for topic, msgtype in outputs.items()}
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()
         self._names = {}  # resolved name -> ours
-        self._waiting: dict[str, list[bytes]] = {}  # by topic, since the last step
         for topic, kind in stream.inputs.items():
-            inbox = self._relay.subscribe(message_class(kind.layout.msgtype), topic,
-                                          lambda cdr, _, topic=topic: self._waiting.setdefault(
-                                              topic, []).append(cdr), qos)
-            self._names[inbox.topic] = topic
+            taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos)
+            self._names[taken.topic] = topic
         self.start_diagnostics("samples", self._status)
 
+    def work(self) -> float:
+        """One turn: take all that waits, one call, publish. See :meth:`Node.work`."""
+        if self._flow.send() and self._deadline is None:  # nothing waits to leave
+            turn = self._flow.take()
+            if turn.begun is not None:
+                self._stream.reset([self._names[topic] for topic in turn.begun])
+            if turn.blocks:
+                self.publish(self._stream.take({
+                    self._names[topic]: [cdr for cdr, _ in messages]
+                    for topic, messages in turn.blocks.items()}))
+            if turn.ended:
+                self.publish(self._stream.end([self._names[topic] for topic in turn.ended]))
+            if turn.event:
+                self.publish(self._stream.finish())
+            self._flow.finish(turn)
+        if self._deadline is not None:
+            self.finished = self._flow.source.drained() or time.monotonic() > self._deadline
+        return self._flow.pause(IDLE)
+
     def publish(self, made: Sequence[Messages]) -> None:
-        """Publish what the stream has made: a list of Messages."""
-        for topic, _, cdr in one_by_one(made):
-            self._outputs[topic].publish(cdr)
+        """Publish what the stream has made."""
+        for part in made:
+            output = self._outputs[part.topic]
+            for cdr in part.cdrs:
+                output.publish(cdr)
+
+    def stop(self) -> None:
+        """End the session, so that whoever listens knows; wait for that only briefly."""
+        self._deadline = time.monotonic() + _FAREWELL
+        self._flow.close()
 
     def summary(self) -> dict:
         """Values of the estimator for diagnostics; subclasses add theirs."""
         return {}
-
-    # The processor of the relay: see nodes/flow/relay.py.
-
-    def reset(self, topics: Sequence[str]) -> None:
-        self._stream.reset([self._names[topic] for topic in topics])
-
-    def step(self) -> bool:
-        waiting, self._waiting = self._waiting, {}
-        if waiting:
-            self.publish(self._stream.take(waiting))
-        return bool(waiting)
-
-    def topic_ended(self, topic: str) -> None:
-        self.step()
-        self.publish(self._stream.end([self._names[topic]]))
-
-    def finish(self) -> None:
-        self.step()
-        self.publish(self._stream.finish())
-
-    def stop(self) -> None:
-        self._relay.close()
-        super().stop()
 
     def _status(self):
         stream = self._stream

@@ -1,6 +1,8 @@
 """The orientation estimator as a node: decode, one call, encode."""
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import yaml
 from builtin_interfaces.msg import Time
@@ -10,7 +12,7 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import ImuFusionError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
-from imu_fusion.nodes.base import run_node
+from imu_fusion.nodes.base import Node, run_node
 from imu_fusion.nodes.estimator import EstimatorNode
 from imu_fusion.streams.orientation import (
     ORIENTATION_TOPIC,
@@ -19,10 +21,10 @@ from imu_fusion.streams.orientation import (
     OrientationStream,
     warm_up,
 )
-from imu_fusion.streams.stream import EstimatorNodeParams
+from imu_fusion.streams.stream import EstimatorNodeParams, Messages
 
 
-def transform_broadcast(node):
+def transform_broadcast(node: Node) -> Callable[[TransformStamped], None]:
     """The function that broadcasts a TransformStamped.
 
     Raises:
@@ -37,7 +39,7 @@ def transform_broadcast(node):
     return TransformBroadcaster(node).sendTransform
 
 
-def transform(cdr, fixed_frame):
+def transform(cdr: bytes, fixed_frame: str) -> TransformStamped:
     """The geometry_msgs/TransformStamped from ``fixed_frame`` to an Imu message's frame."""
     stamp, frame_id, values = IMU.decode(cdr)
     message = TransformStamped(child_frame_id=frame_id)
@@ -69,7 +71,7 @@ class OrientationEstimatorNode(EstimatorNode):
                              ("calibrate_magnetometer", self._calibrate)):
             self.create_service(Trigger, f"~/{name}", self._answering(action))
 
-    def publish(self, made):
+    def publish(self, made: Sequence[Messages]) -> None:
         super().publish(made)
         if self._broadcast is not None:
             frame = self.params(OrientationOutputParams).fixed_frame
@@ -78,10 +80,10 @@ class OrientationEstimatorNode(EstimatorNode):
                     for cdr in part.cdrs:
                         self._broadcast(transform(cdr, frame))
 
-    def summary(self):
+    def summary(self) -> dict:
         return self._stream.estimator.summary()
 
-    def apply(self, params):
+    def apply(self, params: Mapping[type, Any]) -> None:
         self._stream.change(params[OrientationParams])
 
     def _restart(self):
@@ -112,6 +114,6 @@ class OrientationEstimatorNode(EstimatorNode):
         return answer
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(OrientationEstimatorNode, args)

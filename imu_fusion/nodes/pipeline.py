@@ -110,10 +110,7 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         nodes.start("replayer", show=show, params_file=file, **plan.replay_parameters(bag))
         nodes.wait("replayer", _PATIENCE)
         nodes.wait("smoothing_trigger", _PATIENCE)
-        # Rarely the recorder does not notice the end of the smoother's session (why is not
-        # understood): then its file has stopped growing.
-        nodes.finish("recorder", 15.0, lambda: sum(
-            file.stat().st_size for file in Path(out).glob("*.mcap")))
+        nodes.wait("recorder", _PATIENCE)
         domain = nodes.domain
     with open_bag(out) as reader:
         found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import yaml
@@ -125,31 +124,6 @@ class NodeProcesses:
         if self._processes[node].returncode:
             raise NodeError(f"node {node} ended with code {self._processes[node].returncode}: "
                              f"{self._last_words(node)}")
-
-    def finish(self, node: str, patience: float,
-               progress: Callable[[], object] = lambda: None) -> bool:
-        """Wait for the end of a node; ask it to end (as Ctrl-C does) when nothing moves any more.
-
-        Args:
-            patience: seconds in which ``progress()`` may stay the same.
-
-        Returns:
-            Whether the node ended by itself.
-
-        Raises:
-            NodeError: as :meth:`wait`.
-        """
-        process, seen, since = self._processes[node], progress(), time.monotonic()
-        while process.poll() is None and time.monotonic() - since < patience:
-            time.sleep(0.05)
-            now = progress()
-            if now != seen:
-                seen, since = now, time.monotonic()
-        by_itself = process.poll() is not None
-        if not by_itself:
-            process.send_signal(signal.SIGINT)
-        self.wait(node, 15.0)
-        return by_itself
 
     def _announce_compiling(self):
         """Say once what a node says into its log only."""

@@ -6,14 +6,15 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
-from imu_fusion.nodes.base import Node, message_class, run_node
-from imu_fusion.nodes.flow import DEPTH, NEXT, FlowSink, steady_timer
+from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
+from imu_fusion.nodes.flow import DEPTH, NEXT, Flow, steady_timer
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.losses import write_losses
 from imu_fusion.recordings.qos import qos_profile
 
 
@@ -25,7 +26,7 @@ class RecorderParams(Parameters):
     topics: tuple[str, ...] = param((), doc="topics to record; empty: all, or those of `regex`")
     regex: str | None = param(None, doc="record topics that this regular expression matches")
     exclude: tuple[str, ...] = param(
-        ("/rosout", "/parameter_events", "/flow/.*"),
+        ("/rosout", "/parameter_events", ".*/_flow/.*"),
         doc="regular expressions of topics that are not recorded unless listed in `topics`")
     compression: str = param("zstd", doc="compression of chunks", choices=("zstd", "lz4", "none"))
     chunk_size: int = param(256 * 1024, doc="size of a chunk: what a crash can lose", unit="bytes",
@@ -49,8 +50,9 @@ def adapted_qos(infos: Sequence[TopicEndpointInfo]) -> QoSProfile:
     reliable = all(i.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for i in infos)
     latched = bool(infos) and all(
         i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
+    # What is latched comes at once, however much: more than any depth.
     return QoSProfile(
-        depth=DEPTH,
+        depth=DEPTH, history=HistoryPolicy.KEEP_ALL if latched else HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
 
@@ -81,23 +83,47 @@ class Recorder(Node):
                                  overwrite=p.overwrite)
         self._failed = False
         # Under use_sim_time nothing is asked for before there is a time to record it at.
-        self._flow = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end,
-                              hold=lambda: self._sim_time and not self._now())
+        self._flow = Flow(self, on_begin=self._on_begin,
+                          hold=lambda: self._sim_time and not self._now())
+        self.problems = self._flow.problems
+        self._inputs = self._flow.sink.inputs
+        self._msgtypes: dict[str, str] = {}
+        self._has_ended = False  # a session of which something was recorded
         steady_timer(self, 0.2, self._discover)
         self.start_diagnostics("recording", lambda: (b"\0", "recording", dict(self._writer.counts)))
 
+    def work(self) -> float:
+        """One turn: take all that waits, write it. See :meth:`Node.work`."""
+        turn = self._flow.take()
+        for topic, messages in turn.blocks.items():
+            self._write(topic, messages)
+        self._flow.finish(turn)
+        for session in turn.over:
+            self._has_ended = True
+            if session.event != NEXT:
+                self._expected.discard(session.source)
+        if (self._p.end_with_sources and self._has_ended and not self._expected
+                and not self._flow.sink.feeding() and not self._flow.sink.promised()):
+            self.finished = True
+        return self._flow.pause(IDLE)
+
     def close(self) -> None:
         """Close the recording and say what is in it."""
+        self._flow.close()
         if self._failed:
             self._writer.abandon()
             return
+        recorded = dict(self._writer.counts)
+        notes = {topic: _notes(self._inputs[topic]) for topic in recorded if topic in self._inputs}
+        if self.problems:
+            write_losses(self._writer, self._now() or time.time_ns(), self.problems, {
+                topic: ", ".join([f"{count} messages", *notes.get(topic, ())])
+                for topic, count in recorded.items()})
         self._writer.close()
         print(f"recorder: wrote {self._p.out}", file=sys.stderr)
-        for topic, count in sorted(self._writer.counts.items()):
-            inbox = self._flow.inboxes[topic]
-            print(f"  {topic}: {count} messages"
-                  + (f", joined after {inbox.missed}" if inbox.missed else "")
-                  + (f", {inbox.lost} LOST" if inbox.lost else ""), file=sys.stderr)
+        for topic, count in sorted(recorded.items()):
+            print(f"  {topic}: " + ", ".join([f"{count} messages", *notes.get(topic, ())]),
+                  file=sys.stderr)
         for topic in sorted(self._named - self._writer.counts.keys()):
             print(f"  {topic}: never appeared", file=sys.stderr)
 
@@ -111,24 +137,19 @@ class Recorder(Node):
         return not self._named
 
     def _on_begin(self, session):
-        # Before the answer: what the source is about to send must find us subscribed.
-        for topic, msgtype in session.topics.items():
-            self._subscribe(topic, [msgtype])
-
-    def _on_end(self, session):
-        if session.event == NEXT:
-            return
-        self._expected.discard(session.source)
-        if self._p.end_with_sources and not self._expected and not self._flow.feeding():
-            self.finished = True
+        for topic, sent in session.said.topics.items():
+            if topic in self._inputs:
+                self._write(topic, self._inputs[topic].take())  # what came before the session
+            else:
+                self._subscribe(topic, [sent.msgtype])
 
     def _discover(self):
         for topic, msgtypes in self.get_topic_names_and_types():
-            if topic not in self._flow.inboxes and self.count_publishers(topic):
+            if topic not in self._inputs and self.count_publishers(topic):
                 self._subscribe(topic, msgtypes)
 
     def _subscribe(self, topic, msgtypes):
-        if topic in self._flow.inboxes or topic in self._skipped or not self._selects(topic):
+        if topic in self._inputs or topic in self._skipped or not self._selects(topic):
             return
         try:
             if len(msgtypes) > 1:
@@ -144,21 +165,29 @@ class Recorder(Node):
             self.get_logger().warning(f"{topic} is not recorded: {error}")
             return
 
-        def store(cdr, info):
-            self._write(topic, msgtype, cdr, info)
-
-        self._flow.subscribe(cls, topic, store, adapted_qos(infos))
+        self._msgtypes[topic] = msgtype
+        self._flow.input(cls, topic, adapted_qos(infos))
 
     def _now(self):
         return self.get_clock().now().nanoseconds
 
-    def _write(self, topic, msgtype, cdr, info):
-        received = self._now() if self._sim_time else info["received_timestamp"] or time.time_ns()
+    def _write(self, topic, messages):
+        msgtype, now = self._msgtypes[topic], self._now() if self._sim_time else 0
         try:
-            self._writer.write(topic, msgtype, cdr, received, info["source_timestamp"] or received)
+            for cdr, info in messages:
+                received = now or info["received_timestamp"] or time.time_ns()
+                self._writer.write(topic, msgtype, cdr, received,
+                                   info["source_timestamp"] or received)
         except BagError:
             self._failed = True
             raise
+
+
+def _notes(taken):
+    """What must be said of a topic beside the number of its messages."""
+    return [f"{words} {count}" if words.endswith("after") else f"{count} {words}"
+            for words, count in (("joined after", taken.missed), ("LOST", taken.lost),
+                                 ("not of the sessions", taken.unexpected)) if count]
 
 
 def _compile(name, pattern):

@@ -13,12 +13,12 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import ParameterError, TopicError
 from imu_fusion.nodes.base import Node, message_class, run_node
-from imu_fusion.nodes.flow import DEPTH, END, NEXT, FlowSource, reliable_qos, steady_timer
+from imu_fusion.nodes.flow import DEPTH, END, NEXT, Flow, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.bag_reader import find_topic, open_bag
 
-_BURST = 50  # messages sent before services and acknowledgements are looked at
+_BURST = 200  # messages sent before services and acknowledgements are looked at
 _BLOCKED = 0.05  # s, wait of the executor while nothing may be sent; callbacks end it
 
 
@@ -30,8 +30,8 @@ class ReplayerParams(Parameters):
     rate: float = param(1.0, doc="speed as a multiple of the recorded pace; 0: as fast as our "
                         "nodes take it, nothing lost", low=0, read_only=False)
     foreign_rate: float = param(
-        1.0, doc="speed at rate 0 while nodes that are not ours subscribe: they cannot "
-        "acknowledge; 0: do not regard them", low=0)
+        1.0, doc="speed at rate 0 while nodes that are not ours subscribe: they drop what "
+        "their queues cannot hold; 0: do not regard them", low=0)
     start_offset: float = param(0.0, doc="skip this much of the recording", unit="s", low=0)
     duration: float | None = param(None, doc="play this much of the recording", unit="s", low=0)
     loop: bool = param(False, doc="start again at the end")
@@ -74,7 +74,9 @@ class Replayer(Node):
             raise ParameterError(
                 f"parameter 'start_offset': {p.start_offset} s is beyond the end of {p.bag} "
                 f"({(self._bag.end_time - self._bag.start_time) * 1e-9:.3f} s long)")
-        self._source = FlowSource(self, wait_for=p.wait_for_nodes)
+        self._flow = Flow(self, listens=False, wait_for=p.wait_for_nodes)
+        self._source = self._flow.source
+        self.problems = self._flow.problems
         self._outputs = self._make_publishers(p)
         self._clock_out = self.create_publisher(
             Clock, "/clock", reliable_qos(10)) if p.clock else None
@@ -102,7 +104,8 @@ class Replayer(Node):
         """Do what the present phase asks for; see :meth:`Node.work`."""
         if self._deadline is not None and time.monotonic() > self._deadline:
             self.finished = True
-        return self._phase()
+        self._flow.send()
+        return self._flow.pause(self._phase())
 
     def stop(self) -> None:
         """End the session, so that whoever listens knows; wait for that only briefly."""
@@ -117,6 +120,7 @@ class Replayer(Node):
         """Close the recording and say what was sent to whom."""
         self._progress.close()
         self._bag.close()
+        self._flow.close()
         for topic, (sent, lost) in sorted(self._source.report().items()):
             takers = [f"{name}" + (f" ({n} LOST)" if n else "") for name, n in lost.items()]
             takers += [f"{name} (not ours, unchecked)" for name in
@@ -139,7 +143,7 @@ class Replayer(Node):
                 self.get_logger().warning(f"{name} is not played: {error}")
                 continue
             latched = any(q["durability"] == "transient_local" for q in info.qos_profiles)
-            publishers[name] = self._source.publisher(cls, renamed.get(name, name), reliable_qos(
+            publishers[name] = self._flow.output(cls, renamed.get(name, name), reliable_qos(
                 DEPTH, DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
         if not publishers:
             raise TopicError(f"{p.bag}: nothing to play; it has "
@@ -194,7 +198,7 @@ class Replayer(Node):
                 return _BLOCKED
             topic, log_time, data = self._next
             publisher = self._outputs[topic]
-            if not publisher.is_open:
+            if publisher.waiting or not publisher.is_open():
                 return _BLOCKED
             if not self._steps:
                 wait = self._time_to_wait(log_time)
@@ -269,7 +273,7 @@ class Replayer(Node):
         elif p.rate == 0.0 and self._source.foreign and p.foreign_rate:
             names = sorted({n for names in self._source.foreign.values() for n in names})
             text = (f"playing at {p.foreign_rate:g} times the recorded pace, because nodes that "
-                    f"cannot acknowledge subscribe: {', '.join(names)}")
+                    f"may drop messages subscribe: {', '.join(names)}")
         if text and text != self._told:
             self.get_logger().info(text)
         self._told, self._told_at = text, sent

@@ -5,6 +5,8 @@ import multiprocessing
 import sys
 import time
 import traceback
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -17,7 +19,7 @@ from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
-from imu_fusion.nodes.flow import FlowSink, FlowSource, reliable_qos, sensor_qos
+from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
@@ -69,7 +71,8 @@ class _Child:
                                       args=(theirs, params, logs))
         self._process.start()
         theirs.close()
-        self.outcome = self.samples = None  # an Outcome, or the reason why there is none
+        self.samples: Any = None
+        self.outcome: Any = None  # an Outcome, or the reason why there is none
         self._received = 0
 
     def poll(self):
@@ -115,45 +118,51 @@ class SmootherNode(Node):
         p = self.params(SmootherNodeParams)
         self._stream = SmootherStream(self.params(SmoothingParams), p.memory_limit * 1e6,
                                       self.get_logger().warning)
-        self._sink = FlowSink(self, on_begin=self._on_begin)
+        self._flow = Flow(self, on_begin=self._on_begin)
+        self._source = self._flow.source
+        self.problems = self._flow.problems
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()
+        self._names = {}  # resolved name -> ours
         for topic, kind in INPUTS.items():
-            self._sink.subscribe(message_class(kind.layout.msgtype), topic,
-                                 lambda cdr, _, topic=topic: self._stream.take({topic: [cdr]}), qos)
+            taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos)
+            self._names[taken.topic] = topic
         surface_file = self.params(SmoothingParams).surface.file
         if surface_file:
             load_surface(surface_file)  # a bad file ends the node now
-        self._source = FlowSource(self)
-        self._outputs = {topic: self._source.publisher(message_class(msgtype), topic, _latched(1))
+        self._outputs = {topic: self._flow.output(message_class(msgtype), topic, _latched(1))
                          for topic, msgtype in OUTPUTS.items()}
-        self._child = self._answer = self._result = self._messages = None
+        self._child: Any = None
+        self._answer = self._result = self._messages = None
         # Reentrant: a second call is answered while the first one still waits.
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
         self.create_service(Trigger, "~/clear", self._on_clear)
         self.start_diagnostics("collection", self._status)
 
-    def work(self):
-        """See :meth:`Node.work`."""
+    def work(self) -> float:
+        """One turn: take all that waits, smooth, publish. See :meth:`Node.work`."""
+        self._flow.send()
+        turn = self._flow.take()
+        if turn.blocks:
+            self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
+                               for topic, messages in turn.blocks.items()})
+        self._flow.finish(turn)
         if self._answer is not None:
             # The executor polls the coroutine of a waiting service without rest.
             time.sleep(_POLL)
             if not self._answer.done() and self._child.poll():
                 self._answer.set_result(self._child.outcome)
             return 0.0
-        return 0.0 if self._publish() else IDLE
+        return 0.0 if self._publish() else self._flow.pause(IDLE)
 
-    def close(self):
+    def close(self) -> None:
         """End the child, if there is one."""
+        self._flow.close()
         if self._child is not None:
             self._child.close()
 
-    def stop(self):
-        self._source.end()
-        super().stop()
-
     def _on_begin(self, session):
-        if session.topics.keys() & {self.resolve_topic_name(topic) for topic in INPUTS}:
+        if session.said.topics.keys() & self._names.keys():
             self._stream.reset()
 
     async def _on_smooth(self, request, response):
@@ -223,7 +232,7 @@ class SmootherNode(Node):
 
     def _status(self):
         stream = self._stream
-        values = {f"{topic} collected": n for topic, n in stream.counts().items()}
+        values: dict[str, float] = {f"{topic} collected": n for topic, n in stream.counts().items()}
         values |= {f"{topic} {why}": n for topic in stream.inputs
                    for why, n in stream.refused(topic).items()}
         values |= {"megabytes": round(stream.bytes / 1e6, 1), "dropped": stream.dropped}
@@ -236,6 +245,6 @@ class SmootherNode(Node):
         return DiagnosticStatus.OK, "collecting", values
 
 
-def main(args=None):
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable."""
     return run_node(SmootherNode, args)

@@ -9,8 +9,7 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import EstimationError, TopicError
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
-from imu_fusion.nodes.flow import BEGIN, NEXT, FlowSink
-from imu_fusion.nodes.flow.protocol import STATUS_TOPIC, full_name
+from imu_fusion.nodes.flow import NEXT, Flow
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.streams.smoother import INPUTS, REQUIRED
 
@@ -35,19 +34,27 @@ class SmoothingTrigger(Node):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self._source = None  # name of the node whose replay has ended
+        self._source = None  # instance whose replay has ended
         self._sent = None
         self._client = self.create_client(Trigger, self.params(SmoothingTriggerParams).service)
         self._seen_at = time.monotonic()
-        self._sink = FlowSink(self, on_begin=self._on_begin, on_end=self._on_end)
+        self._flow = Flow(self, on_begin=self._on_begin)
         self._names = {self.resolve_topic_name(topic): topic for topic in INPUTS}
         for topic, kind in INPUTS.items():
-            self._sink.subscribe(message_class(kind.layout.msgtype), topic, lambda cdr, info: None)
+            self._flow.input(message_class(kind.layout.msgtype), topic)
 
     def work(self) -> float:
         """See :meth:`Node.work`."""
+        turn = self._flow.take()
+        self._flow.finish(turn)
+        for session in turn.over:
+            if session.broken:
+                raise EstimationError(f"not smoothed: the replay of {session.source} broke off")
+            if session.event != NEXT:
+                self._source = session.instance
+                self._seen_at = time.monotonic()
         if self._source is None:
-            return IDLE
+            return self._flow.pause(IDLE)
         if self._client.service_is_ready():
             self._seen_at = time.monotonic()
         elif time.monotonic() - self._seen_at > self.params(SmoothingTriggerParams).wait_timeout:
@@ -57,7 +64,7 @@ class SmoothingTrigger(Node):
             raise EstimationError(f"service {self._client.srv_name} has vanished without an answer")
         if self._sent is None:
             # The source stays until every sink has everything: the smoother may lag behind us.
-            if self._client.service_is_ready() and self._source not in self._sources():
+            if self._client.service_is_ready() and self._source not in self._flow.peers:
                 self._sent = self._client.call_async(Trigger.Request())
         elif self._sent.done():
             answer = self._sent.result()
@@ -67,22 +74,12 @@ class SmoothingTrigger(Node):
             self.finished = True
         return IDLE
 
-    def _sources(self):
-        return {full_name(info) for info in self.get_publishers_info_by_topic(STATUS_TOPIC)}
-
     def _on_begin(self, session):
         played = {self._names.get(topic) for topic in session.topics}
         missing = [topic for topic in REQUIRED if topic not in played]
         if played & set(INPUTS) and missing:
             raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there will be "
                              "nothing to smooth")
-
-    def _on_end(self, session):
-        if session.event == BEGIN:
-            raise EstimationError(f"not smoothed: the replay of {session.source} broke off")
-        if session.event != NEXT:
-            self._source = session.source
-            self._seen_at = time.monotonic()
 
 
 def main(args: Sequence[str] | None = None) -> int:

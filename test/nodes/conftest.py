@@ -10,7 +10,7 @@ from sensor_msgs.msg import Imu
 
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.nodes.base import use_fast_heartbeats
-from imu_fusion.nodes.flow import FlowSink
+from imu_fusion.nodes.flow import Flow
 from imu_fusion.recordings.bag_writer import BagWriter
 
 START = 1_700_000_000_000_000_000
@@ -79,18 +79,29 @@ def graph():
 
 
 class Collector:
-    """Receives a session; the messages of each topic, in order."""
+    """Takes sessions: the messages of each topic in order, what came with them, how they ended."""
 
     def __init__(self, node, topics, **options):
         self.messages = {topic: [] for topic in topics}
+        self.infos = {topic: [] for topic in topics}
         self.ended = []
-        self.sink = FlowSink(node, on_end=lambda session: self.ended.append(session.event),
-                             **options)
+        self.takes = True
+        self.flow = Flow(node, **options)
+        self.flow.sink.gate.can_execute = lambda entity: self.takes
         for topic, msg_type in topics.items():
-            self.sink.subscribe(msg_type, topic, self._store(topic))
+            self.flow.input(msg_type, topic)
+        node.work, node.finished = self.work, False
 
-    def _store(self, topic):
-        return lambda cdr, info: self.messages[topic].append(cdr)
+    def work(self):
+        """One turn."""
+        if self.takes:
+            turn = self.flow.take()
+            for topic, block in turn.blocks.items():
+                self.messages[topic] += [cdr for cdr, _ in block]
+                self.infos[topic] += [info for _, info in block]
+            self.ended += [session.event for session in turn.over]
+            self.flow.finish(turn)
+        return self.flow.pause(0.05)
 
 
 def collector(graph, name="collector", topics=None, **options):

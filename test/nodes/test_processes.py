@@ -13,11 +13,12 @@ from sensor_msgs.msg import Imu
 from imu_fusion.kernels import NOTICE
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.nodes import processes
-from imu_fusion.nodes.flow import ACK_EVERY, END, FlowSource
+from imu_fusion.nodes.flow import END, Flow
 from imu_fusion.nodes.pipeline import run_pipeline
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
-from test.nodes.conftest import START, STEP, collector
+from imu_fusion.recordings.losses import read_losses
+from test.nodes.conftest import START, STEP, collector, write_bag
 from test.nodes.test_smoother import write
 
 SCRIPTS = Path(sys.executable).parent
@@ -52,21 +53,23 @@ def test_replay_through_processes_ends_by_itself_and_says_what_it_sent(bag, tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_closes_the_recording_with_all_that_was_acknowledged(graph, tmp_path, number):
+def test_signal_closes_the_recording_with_all_that_was_taken(graph, tmp_path, number):
     out = tmp_path / "out"
     recorder = start("recorder", out=out, topics="[/imu/data_raw]")
-    source = FlowSource(graph.node("talker"), wait_for=["recorder"])
-    publisher = source.publisher(Imu, "/imu/data_raw")
-    source.begin()
-    graph.until(source.ready)
-    for i in range(2 * ACK_EVERY):
-        publisher.publish(imu_message(START + i * STEP, "imu_link", (0, 0, 0), (i, 0, 0)))
-    graph.until(lambda: source.acknowledged("/imu/data_raw") == 2 * ACK_EVERY)
+    flow = Flow(graph.node("talker"), listens=False, wait_for=["recorder"])
+    output = flow.output(Imu, "/imu/data_raw")
+    flow.source.begin()
+    graph.until(flow.source.is_settled)
+    for i in range(250):
+        output.publish(imu_message(START + i * STEP, "imu_link", (0, 0, 0), (i, 0, 0)))
+    graph.until(lambda: flow.source.taken("/imu/data_raw") == 250)
     recorder.send_signal(number)
     code, said = end(recorder)
     assert code == 0 and "Traceback" not in said, said
     with open_bag(out) as reader:
-        assert not reader.warnings and reader.topics["/imu/data_raw"].count == 2 * ACK_EVERY
+        assert not reader.warnings and reader.topics["/imu/data_raw"].count == 250
+    graph.until(lambda: not flow.peers)  # it has said good-bye
+    assert not flow.problems
 
 
 def test_signal_to_the_replayer_ends_its_session(graph, bag):
@@ -136,9 +139,11 @@ def test_kernels_are_compiled_before_any_node_starts(tmp_path, monkeypatch, caps
     assert not started and capsys.readouterr().err == "compiling for this machine\n"
 
 
-def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, monkeypatch, capsys):
-    """A recorder without a session never ends; asked to, it closes its recording. What nodes say
-    into their logs while they compile is passed on."""
+
+
+def test_a_node_closes_its_files_when_asked_to_end(tmp_path, monkeypatch, capsys):
+    """A recorder without a session never ends by itself. What nodes say into their logs while
+    they compile is passed on."""
     monkeypatch.setattr(processes, "compile_ahead", lambda say: None)
     with NodeProcesses(tmp_path / "logs") as nodes:
         nodes.start("recorder", out=str(tmp_path / "bag"))
@@ -148,6 +153,85 @@ def test_a_node_that_does_not_end_by_itself_is_asked_to(tmp_path, monkeypatch, c
             time.sleep(0.05)
         with open(tmp_path / "logs" / "recorder.log", "a") as log:
             log.write(f"[INFO] [recorder]: {NOTICE}\n")
-        assert nodes.finish("recorder", 0.5) is False
+        nodes.process("recorder").send_signal(signal.SIGINT)
+        nodes.wait("recorder", 15.0)
     assert capsys.readouterr().err == NOTICE + "\n"
     assert (tmp_path / "bag" / "metadata.yaml").exists()
+
+
+def recorded(path):
+    """{topic: number of messages}."""
+    with open_bag(path) as reader:
+        return {topic: info.count for topic, info in reader.topics.items()}
+
+
+@pytest.mark.slow
+def test_a_long_lived_estimator_loses_nothing_of_short_recordings(bag, tmp_path):
+    """One after the other, with a new replayer and a new recorder under the names of the last."""
+    estimator = start("orientation_estimator")
+    found = []
+    for i in range(6):
+        recorder = start("recorder", out=tmp_path / f"out{i}")
+        replayer = start("replayer", bag=bag, rate="0.0",
+                         wait_for_nodes="[recorder, orientation_estimator]")
+        for process in (replayer, recorder):
+            code, said = end(process)
+            assert code == 0, said
+        found.append(recorded(tmp_path / f"out{i}"))
+    estimator.send_signal(signal.SIGINT)
+    code, said = end(estimator)
+    assert code == 0, said
+    assert found[0]["/imu/data_raw"] == 200 and found[0]["/imu/mag"] == 50
+    assert found[0]["/imu/data"] > 100 and found[0]["/imu/flags"] > 0
+    for other in found[1:]:
+        assert {t: n for t, n in other.items() if t != "/diagnostics"} == {
+            t: n for t, n in found[0].items() if t != "/diagnostics"}
+
+
+@pytest.mark.slow
+def test_a_killed_estimator_that_is_started_again_stalls_nothing(graph, tmp_path):
+    """What is missing is said by all that know of it, and stands in the recording."""
+    bag, out = write_bag(tmp_path / "bag", 1500), tmp_path / "out"
+    recorder = start("recorder", out=out)
+    first = start("orientation_estimator")
+    sink = collector(graph, topics={"/imu/data": Imu})
+    replayer = start("replayer", bag=bag, rate="1.0",
+                     wait_for_nodes="[recorder, orientation_estimator]")
+    graph.until(lambda: len(sink.messages["/imu/data"]) > 50)
+    sink.flow.close()
+    graph.remove(graph.nodes[-1])
+    first.kill()
+    first.communicate()
+    again = start("orientation_estimator")
+    code, said = end(replayer)
+    assert code == 1 and "/orientation_estimator has vanished in mid-session" in said, said
+    code, said = end(recorder)
+    assert code == 1 and "the session of /orientation_estimator broke off" in said, said
+    again.send_signal(signal.SIGINT)
+    code, said = end(again)
+    assert code == 1 and "joined /replayer late" in said, said
+    counts = recorded(out)
+    assert counts["/imu/data_raw"] == 1500 and counts["/imu/mag"] == 375
+    with open_bag(out) as reader:
+        lines = read_losses(reader)
+    assert any("broke off" in line for line in lines)
+    assert any("incomplete data: it lacks" in line for line in lines)
+    assert "/imu/data_raw: 1500 messages" in lines
+
+
+@pytest.mark.slow
+def test_the_recorder_ends_when_its_source_was_killed_and_says_so(graph, bag, tmp_path):
+    out = tmp_path / "out"
+    recorder = start("recorder", out=out)
+    sink = collector(graph)
+    replayer = start("replayer", bag=bag, rate="0.1", wait_for_nodes="[recorder]")
+    graph.until(lambda: len(sink.messages["/imu/data_raw"]) > 20)
+    replayer.kill()
+    replayer.communicate()
+    code, said = end(recorder)
+    assert code == 1 and "the session of /replayer broke off: it has vanished" in said, said
+    graph.until(lambda: sink.ended)
+    done = subprocess.run([SCRIPTS / "imu_fusion", "info", out], env=ENVIRONMENT,
+                          capture_output=True, text=True, timeout=60, check=False)
+    assert "warning: the session of /replayer broke off" in done.stdout, done
+    assert recorded(out)["/imu/data_raw"] > 20

@@ -8,7 +8,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Int64, String
 
 from imu_fusion.errors import BagError, ParameterError
-from imu_fusion.nodes.flow import FlowSource
+from imu_fusion.nodes.flow import Flow
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.recordings.bag_reader import open_bag
@@ -178,12 +178,13 @@ def test_sim_time_without_a_clock_still_finds_topics(graph, tmp_path):
 def test_ends_when_an_unrelated_session_ends_last(graph, tmp_path):
     """The session of /b, of which nothing is recorded, ends after the one that counts."""
     recorder = graph.start(Recorder, out=str(tmp_path / "out"), topics=["/a"])
-    first, second = (FlowSource(graph.node(name), wait_for=["recorder"]) for name in "ab")
-    out = first.publisher(Int64, "/a")
-    second.publisher(Int64, "/b")
-    first.begin()
-    second.begin()
-    graph.until(lambda: first.ready() and second.ready())
+    first, second = (Flow(graph.node(name), listens=False, wait_for=["recorder"])
+                     for name in "ab")
+    out = first.output(Int64, "/a")
+    second.output(Int64, "/b")
+    first.source.begin()
+    second.source.begin()
+    graph.until(lambda: first.source.is_settled() and second.source.is_settled())
     out.publish(Int64(data=1))
-    first.end()
+    first.source.end()
     graph.until(lambda: recorder.finished)

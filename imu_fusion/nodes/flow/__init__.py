@@ -1,47 +1,47 @@
 """Flow control between our nodes: nothing lost, ends known, whatever the speed.
 
-DDS drops messages when a subscriber lags (KEEP_LAST) or blocks the publisher
-(KEEP_ALL). So our nodes count. A *session* is one pass of data from a *source*
-(the replayer, or a node that processes a session of somebody else):
+A *session* is one pass of data from a node that sends it (the replayer, or a node that
+processes the session of somebody else). What makes it lossless:
 
-1. The source announces the session on ``/flow/status``: its topics, with types
-   and the sequence number after which the session starts, and the sinks that it
-   knows. A node between waits for the same sinks: two nodes that the source has
-   discovered may not have discovered each other.
-2. Every node that owns a :class:`FlowSink` (seen in the graph as a publisher of
-   ``/flow/ack``) answers on ``/flow/ack`` which of the topics it takes. The
-   source sends nothing before all have answered, and their subscriptions are
-   reliable and matched.
-3. Sinks acknowledge the highest sequence number received. The source keeps at
-   most ``WINDOW`` messages per topic unacknowledged, less than the queue depth.
-4. At the end the source states the last sequence number of each topic, so that
-   a sink knows when it has everything, or what it lost, and says that it is done.
+1. **DDS holds back.** Writers are RELIABLE KEEP_LAST 1000, readers in a session KEEP_ALL. After
+   500 messages (or 16 MB) a writer waits until all are acknowledged; an acknowledged message is
+   in the queue of the reader. A full queue acknowledges nothing. In a node between, what may not
+   leave waits, and while anything waits the node does not take: its queues fill, its writers stop.
+2. **Each node says what it does**, on one latched topic of its own, ``<node>/_flow/<instance>``
+   (diagnostic_msgs/DiagnosticArray, :class:`State`): which session it sends, with a writer and
+   counts for each topic, and which sessions it has joined and finished. Always all of it: who
+   hears the last state knows everything, and none can be overwritten unheard. An instance is one
+   start of a node: the same name later, or twice, is somebody else.
+3. **Joining**: a session lists the instances that it knows, and sends nothing before each has
+   answered with the readers that it has made, and these are matched. Who comes later is added to
+   the list: sending stops, the counts are stated, the newcomer answers. A node between takes
+   nothing before its own session may send, and lists also those whom its sender knows (discovery
+   between each two nodes takes its own time); so readiness passes along the chain.
+4. **The end** is stated, with the counts, when all is acknowledged: then it is in the queue of
+   each reader, which takes what there is, compares, finishes, and says so. The sender stays until
+   all have. More or less than the count, a sender that broke off, a joined one that vanished: a
+   *problem*, which is said, and makes the exit code 1 (:attr:`Flow.problems`).
 
-A processing node is sink and source, tied by a :class:`Relay`: it answers and
-acknowledges upstream only while its own outputs may flow, so that back pressure,
-readiness and the end of the stream pass through any chain of nodes.
+Who speaks: a state is believed if the graph shows one writer of its topic, always the same, and
+writers of the data that belong to that node. Anything else is ignored with a warning; two writers
+of one state are waited for, ten seconds, and then both given up.
 
-Without a session (live drivers) nobody waits and nobody acknowledges. Other
-people's subscribers never acknowledge; :attr:`FlowSource.foreign` names them.
+Without a session (live drivers) nobody waits. Other people's subscribers are named
+(:attr:`Flow.foreign`). One that acknowledges nothing cannot stop a session: those who joined
+tell once a second how much they have taken, and that opens the writer as well (so it is slow,
+500 messages a second). The same numbers bound what waits in queues: 64 MB a topic.
 
-Both topics carry diagnostic_msgs/DiagnosticStatus: ``name`` is the node,
-``hardware_id`` the session, ``message`` the event, ``values`` topic and numbers.
+Limits. Each hop buffers up to 5000 messages a topic (KEEP_ALL in Fast DDS). Nobody can tell the
+messages of two publishers of one topic: a second one is named and its messages are counted as
+not expected, but reach the estimators. A killed node is noticed when its lease of five seconds
+is over (fastdds.xml; twenty with other profiles). Tried with Fast DDS; other middleware must
+acknowledge what is in the queue of the reader, and answer ``wait_for_all_acked`` at once.
 """
 
-from imu_fusion.nodes.flow.protocol import (
-    ACK_EVERY,
-    BEGIN,
-    DEPTH,
-    END,
-    NEXT,
-    WINDOW,
-    reliable_qos,
-    sensor_qos,
-    steady_timer,
-)
-from imu_fusion.nodes.flow.relay import Relay
-from imu_fusion.nodes.flow.sink import FlowSink
-from imu_fusion.nodes.flow.source import FlowSource
+from imu_fusion.nodes.flow.flow import Flow
+from imu_fusion.nodes.flow.qos import DEPTH, reliable_qos, sensor_qos, steady_timer
+from imu_fusion.nodes.flow.sink import Turn
+from imu_fusion.nodes.flow.state import BEGIN, END, NEXT
 
-__all__ = ["ACK_EVERY", "BEGIN", "DEPTH", "END", "NEXT", "WINDOW", "FlowSink", "FlowSource",
-           "Relay", "reliable_qos", "sensor_qos", "steady_timer"]
+__all__ = ["BEGIN", "DEPTH", "END", "NEXT", "Flow", "Turn", "reliable_qos", "sensor_qos",
+           "steady_timer"]

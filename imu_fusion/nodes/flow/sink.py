@@ -1,288 +1,357 @@
-"""The subscribing side of a session: :class:`FlowSink`."""
+"""The taking side of sessions."""
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
-from imu_fusion.nodes.flow.protocol import (
-    ACK,
-    ACK_EVERY,
-    ACK_QOS,
-    ACK_TOPIC,
-    BEGIN,
-    COMPANY,
-    DONE,
-    NEXT,
-    STATUS_HEARD,
-    STATUS_TOPIC,
-    full_name,
-    is_reliable,
-    reliable_qos,
-    status_message,
-    steady_timer,
-    subscribe_raw,
-)
+from imu_fusion.nodes.flow.peers import Peer, Peers
+from imu_fusion.nodes.flow.qos import made, reliable_qos, session_qos
+from imu_fusion.nodes.flow.state import BEGIN, END, NEXT, Joined, Sending, Taken
 
-PATIENCE = 5.0  # s of silence after which the last messages of an ended session count as lost
+AT_ONCE = 2000  # messages of one topic that are taken in one turn
+NAP = 0.002  # s, in which a block grows
+SILENCE = 5.0  # s, after which what is missing at the end counts as lost
+REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
+REPORT_EVERY = 1.0  # s
+
+Message = tuple[bytes, dict]
+"""CDR bytes; source_timestamp, received_timestamp (ns) and numbers, as rclpy has them."""
+
+
+@dataclass(eq=False)
+class Session:
+    """A session as who takes it sees it."""
+
+    id: str
+    instance: str
+    source: str  # name of the node
+    said: Sending
+    topics: dict[str, int]  # those taken -> count of the writer when we joined
+    late: int = 0  # messages before that
+    answered: int = 0  # version of its company with which we are ready
+    broken: bool = False
+    finished: bool = False
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its sender has said so, or has vanished."""
+        return self.broken or self.said.event != BEGIN
+
+    @property
+    def event(self) -> str:
+        """How it ended."""
+        return NEXT if self.said.event == NEXT else END
 
 
 @dataclass
-class Session:
-    """A session as a sink sees it: topics map to message types."""
+class Turn:
+    """What has happened since the last turn, in this order.
 
-    id: str
-    source: str
-    topics: dict
-    start: dict  # topic -> sequence number before the first message
-    final: dict | None = None  # topic -> sequence number of the last message
-    event: str = BEGIN
-    idle_since: float = 0.0
-    seen_in_graph: bool = False
-    is_open: bool = True
-    company: set = field(default_factory=set)  # sinks that the source knows
-
-
-class Inbox:
-    """What a sink counts of one topic."""
-
-    def __init__(self, topic, msg_type, callback, qos):
-        self.topic = topic
-        self.msg_type = msg_type
-        self.callback = callback
-        self.qos = qos  # outside sessions
-        self.subscription = None
-        self.session = None
-        self.last = None  # sequence number of the last message
-        self.received = 0
-        self.missed = 0  # of the session, before the first message: we joined late
-        self.lost = 0  # after that
-        self.unacknowledged = 0
-        self.final = None
-
-
-class FlowSink:
-    """The subscribing side: counts, acknowledges, and knows when a session is over.
-
-    Args:
-        node: the rclpy node.
-        on_begin: called with each new :class:`Session`, before it is answered; may
-            subscribe to more topics.
-        on_company: called with a session whose source has learnt of more sinks.
-        on_topic_end: called with a topic when all of it has arrived.
-        on_end: called with a session when all its topics that are taken have ended.
-        hold: while it returns true, acknowledgements are withheld (see :meth:`release`).
-        confirm: whether the sink says that it is done by itself; else see :meth:`done`.
+    ``begun``: the input topics of the sessions that are open, if one has begun; ``blocks``: the
+    messages of each topic; ``ended``: topics of which nothing more comes; ``over``: sessions that
+    have ended and were taken to the end, ``event`` how the last of all ended (empty while
+    others are open); ``lost``: messages that these lack, as far as is known.
     """
 
-    def __init__(self, node, *, on_begin=lambda session: None,
-                 on_company=lambda session: None, on_topic_end=lambda topic: None,
-                 on_end=lambda session: None,
-                 hold=lambda: False, confirm=True, ack_every=ACK_EVERY):
-        self._node = node
-        self._name = node.get_fully_qualified_name()
-        self._on_begin, self._on_company = on_begin, on_company
-        self._on_topic_end, self._on_end = on_topic_end, on_end
-        self._hold = hold
-        self._confirm = confirm
-        self._unconfirmed = []
-        self._ack_every = ack_every
-        self._owed = False
-        self.inboxes = {}
-        self.sessions = {}  # open ones, by source
-        self._ack = node.create_publisher(DiagnosticStatus, ACK_TOPIC, ACK_QOS)
-        node.create_subscription(DiagnosticStatus, STATUS_TOPIC, self._on_status, STATUS_HEARD)
-        steady_timer(node, 0.5, self._watch)
+    begun: list[str] | None = None
+    blocks: dict[str, list[Message]] = field(default_factory=dict)
+    ended: list[str] = field(default_factory=list)
+    over: list[Session] = field(default_factory=list)
+    event: str = ""
+    lost: int = 0
 
-    def subscribe(self, msg_type, topic, callback, qos=None):
-        """Subscribe to CDR bytes: ``callback(cdr, info)``; returns the :class:`Inbox`.
 
-        A best-effort subscription hears any live publisher. During a session it is
-        exchanged for a reliable one, so that nothing gets lost.
+class _Gate(ReentrantCallbackGroup):
+    """Subscriptions of an executor's wait set, while ``is_open()``."""
+
+    def __init__(self, is_open):
+        super().__init__()
+        self._is_open = is_open
+
+    def can_execute(self, entity):
+        return self._is_open()
+
+
+class Input:
+    """One subscription: live, or of a session. The counts are of all its sessions together."""
+
+    def __init__(self, sink: "Sink", msg_type: type, topic: str, qos: QoSProfile) -> None:
+        self.msg_type, self.topic, self.qos = msg_type, topic, qos
+        self.subscription: Subscription
+        self.reader = ""  # its gid
+        self.in_session = False  # whether it reads as in one
+        self.lost = self.unexpected = self.missed = 0  # missed: sent before we joined
+        self.sessions: list[Session] = []  # until all of them have ended
+        self.count = 0  # taken in them
+        self.heard_at = 0.0
+        self.is_empty = False
+        self._first: list[Message] = []  # taken by the executor
+        self._sink = sink
+        self.listen(False)
+
+    def listen(self, in_session: bool) -> None:
+        """Subscribe anew."""
+        node, qos = self._sink.node, session_qos() if in_session else self.qos
+        callback: Any = self._on_data  # rclpy counts its arguments; its types know of one
+        self.in_session = in_session
+        if self.reader:
+            node.destroy_subscription(self.subscription)
+        self.subscription, self.reader = made(
+            node.get_subscriptions_info_by_topic, self.topic,
+            lambda: node.create_subscription(self.msg_type, self.topic, callback, qos,
+                                             raw=True, callback_group=self._sink.gate),
+            self._sink.participant)
+
+    def _on_data(self, cdr, info):
+        # What wakes the executor; the rest is taken with it in the next turn.
+        self._first.append((cdr, info))
+        self._sink.woken = True
+
+    def take(self) -> list[Message]:
+        """All that waits, up to AT_ONCE."""
+        messages, self._first = self._first, []
+        handle = self.subscription.handle
+        with handle:
+            while len(messages) < AT_ONCE:
+                taken = handle.take_message(self.msg_type, True)
+                if taken is None:
+                    self.is_empty = True
+                    return messages
+                messages.append(taken)
+        self.is_empty = False
+        return messages
+
+    def is_complete(self) -> bool:
+        """Whether nothing more comes: all is taken, or what is missing does not come."""
+        if not (self.sessions and self.is_empty and all(s.has_ended for s in self.sessions)):
+            return False
+        missing = self.expected() - self.count
+        return missing <= 0 or time.monotonic() - self.heard_at > SILENCE
+
+    def expected(self) -> int:
+        """Messages that the sessions should bring; those of one that broke off are not known."""
+        return sum(s.said.topics[self.topic].sent - s.topics[self.topic]
+                   for s in self.sessions if not s.broken)
+
+
+class Sink:
+    """What a node takes.
+
+    Args:
+        hold: while it returns true, no session is joined.
+        gate: while it returns false, nothing is taken.
+        may_answer: while it returns false, sessions that are joined are not answered.
+        on_begin: called with the :class:`Session` that is about to be joined; may add inputs.
+        on_join: called when topics of a session are taken, before that is said.
+        say, problem: as of a source.
+    """
+
+    def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
+                 hold: Callable[[], bool], gate: Callable[[], bool],
+                 may_answer: Callable[[], bool], on_begin: Callable[[Session], None],
+                 on_join: Callable[[], None], say: Callable[[], None],
+                 problem: Callable[[str], None]) -> None:
+        self.node, self.participant = node, participant
+        self.inputs: dict[str, Input] = {}
+        self.sessions: dict[str, Session] = {}  # by instance of the sender
+        self.gate = _Gate(gate)
+        self.woken = False
+        self._may_answer = may_answer
+        self._peers, self._own = peers, own
+        self._hold, self._on_begin, self._on_join = hold, on_begin, on_join
+        self._say, self._problem = say, problem
+        self._begun = False
+        self._reported: dict[str, int] = {}  # topic -> count
+        self._unreported = 0.0  # bytes
+        self._report_at = 0.0
+        self._over: list[Session] = []
+
+    def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None) -> Input:
+        """A new :class:`Input`; ``qos`` is that outside sessions."""
+        topic = self.node.resolve_topic_name(topic)
+        found = self.inputs[topic] = Input(self, msg_type, topic, qos or reliable_qos())
+        return found
+
+    def feeding(self) -> list[Session]:
+        """The sessions of which this node takes topics, until they are finished."""
+        return [s for s in self.sessions.values() if s.topics and not s.finished]
+
+    def company(self) -> set[str]:
+        """The instances that the senders of these sessions know."""
+        return {i for s in self.feeding() for i in s.said.company} - {self._own}
+
+    def joined(self) -> Mapping[str, Joined]:
+        """What is said of the sessions.
+
+        One that feeds what this node sends is answered when that may be sent, and to all whom
+        its sender knows: it begins when all behind this node are ready, too.
         """
-        topic = self._node.resolve_topic_name(topic)
-        inbox = self.inboxes[topic] = Inbox(topic, msg_type, callback, qos or reliable_qos())
-        self._listen(inbox, inbox.qos)
         for session in self.sessions.values():
-            if topic in session.topics:
-                self._enter(inbox, session)
-        return inbox
+            if not session.topics or self._may_answer():
+                session.answered = session.said.version
+        return {s.instance: Joined(s.id, s.answered, s.finished, {
+            topic: Taken(self.inputs[topic].reader, base + self._reported.get(topic, 0),
+                         self.inputs[topic].lost)
+            for topic, base in s.topics.items()})
+            for s in self.sessions.values() if s.answered}
 
-    def release(self):
-        """Send the acknowledgements that ``hold`` has withheld."""
-        if self._owed:
-            self.acknowledge()
-
-    def acknowledge(self):
-        """Tell the sources of the open sessions that we take how far we are."""
-        self._owed = self._hold()
-        if not self._owed:
-            for session in self.sessions.values():
-                taken = self._taken(session)
-                if taken:
-                    self._send_ack(session, taken)
-
-    def done(self):
-        """Confirm the sessions that have ended."""
-        while self._unconfirmed:
-            session = self._unconfirmed.pop()
-            self._send_ack(session, self._taken(session), DONE)
-
-    def feeding(self):
-        """The open sessions of which this node takes topics."""
-        return [s for s in self.sessions.values() if self._taken(s)]
-
-    def _taken(self, session):
-        return [self.inboxes[t] for t in session.topics if t in self.inboxes
-                and self.inboxes[t].session is session]
-
-    def _send_ack(self, session, taken, event=ACK):
-        for inbox in taken:
-            inbox.unacknowledged = 0
-        self._ack.publish(status_message(self._name, session.id, event, {
-            inbox.topic: f"{inbox.last} {inbox.lost}" for inbox in taken}))
-
-    def _listen(self, inbox, qos):
-        if inbox.subscription is not None:
-            self._node.destroy_subscription(inbox.subscription)
-        inbox.subscription = subscribe_raw(
-            self._node, inbox.msg_type, inbox.topic,
-            lambda cdr, info: self._on_data(inbox, cdr, info), qos)
-
-    def _enter(self, inbox, session):
-        if not is_reliable(inbox.subscription.qos_profile):
-            self._listen(inbox, reliable_qos(durability=inbox.qos.durability))
-        # A sink that joined late has heard messages of this session already.
-        heard = inbox.session is None and inbox.received and inbox.last is not None
-        if not heard or inbox.last < session.start[inbox.topic]:
-            inbox.last = session.start[inbox.topic]
-        inbox.session = session
-        inbox.final = None
-        inbox.received = inbox.received if heard else 0
-        inbox.missed = inbox.lost = 0
-
-    def _on_status(self, message):
-        if message.name == self._name:
-            return
-        if message.message == BEGIN:
-            self._begin(message)
-            return
-        session = self.sessions.get(message.name)
-        if session is None or session.id != message.hardware_id:
-            return
-        session.event = message.message
-        session.idle_since = time.monotonic()
-        session.final = {entry.key: int(entry.value) for entry in message.values}
-        for inbox in self._taken(session):
-            inbox.final = session.final[inbox.topic]
-            if inbox.last >= inbox.final:
-                self._on_topic_end(inbox.topic)
-        self._check_end(session)
-
-    def _begin(self, message):
-        values = {entry.key: entry.value for entry in message.values}
-        company = set(values.pop(COMPANY).split())
-        old = self.sessions.get(message.name)
-        if old is not None and old.id == message.hardware_id:
-            old.company = company
-            self._on_company(old)
-            return
-        if old is not None:
-            old.event = NEXT
-            self._abandon(old, "was replaced by a new one")
-        start, topics = {}, {}
-        for topic, value in values.items():
-            sent, topics[topic], *renewed = value.split()
-            start[topic] = int(sent)
-            if renewed and topic in self.inboxes and self.inboxes[topic].session is None:
-                self.inboxes[topic].last = None  # of the writer before
-        session = Session(message.hardware_id, message.name, topics, start,
-                          idle_since=time.monotonic(), company=company)
-        self.sessions[session.source] = session
-        for topic in topics:
-            if topic in self.inboxes:
-                self._enter(self.inboxes[topic], session)
-        self._on_begin(session)
-        if self._taken(session):
-            self.acknowledge()
-        else:  # never withheld: sources that feed each other would wait in a circle
-            self._send_ack(session, [])
-
-    def _on_data(self, inbox, cdr, info):
-        sequence = info["publication_sequence_number"]
-        last = inbox.last
-        if last is None:
-            last = 0 if sequence is None else sequence - 1
-        if sequence is None:  # this middleware does not number: count
-            sequence = last + 1
-        session = inbox.session
-        # Without a session there may be several writers, each with numbers of its own.
-        if sequence > last + 1 and session is not None:
-            if inbox.received:
-                inbox.lost += sequence - last - 1
-            else:
-                inbox.missed += sequence - last - 1
-        inbox.last = sequence  # not above the last one: another writer, counted from there
-        inbox.received += 1
-        inbox.callback(cdr, info)
-        if session is None or not session.is_open:
-            return
-        inbox.unacknowledged += 1
-        if inbox.final is not None:
-            session.idle_since = time.monotonic()
-            if sequence >= inbox.final:
-                self._on_topic_end(inbox.topic)
-                self._check_end(session)
-                return
-        if inbox.unacknowledged >= self._ack_every:
-            self.acknowledge()
-
-    def _check_end(self, session):
-        taken = self._taken(session)
-        if session.final is None or any(i.last < i.final for i in taken):
-            return
-        self._close(session, taken)
-
-    def _close(self, session, taken):
-        session.is_open = False
-        del self.sessions[session.source]
-        if taken:
-            self._unconfirmed.append(session)
-            self._on_end(session)
-            if self._confirm:
-                self.done()
-
-    def _abandon(self, session, why):
-        """Close a session that will not complete by itself."""
-        taken = self._taken(session)
-        if taken:
-            self._node.get_logger().warning(f"the session of {session.source} {why}")
-        for inbox in taken:
-            if inbox.final is None or inbox.last < inbox.final:
-                if inbox.final is not None:
-                    inbox.lost += inbox.final - inbox.last
-                    self._node.get_logger().warning(
-                        f"{inbox.topic}: {inbox.final - inbox.last} messages have not arrived")
-                    inbox.last = inbox.final
-                self._on_topic_end(inbox.topic)
-        self._close(session, taken)
-
-    def _watch(self):
-        """Find sessions that cannot end: their source is gone, or their tail was lost."""
-        self.release()
-        for inbox in self.inboxes.values():
-            session = inbox.session
-            if session is not None and not session.is_open and session.event != NEXT and (
-                    is_reliable(inbox.subscription.qos_profile) != is_reliable(inbox.qos)):
-                self._listen(inbox, inbox.qos)
-        if not self.sessions:
-            return
-        sources = {full_name(i) for i in self._node.get_publishers_info_by_topic(STATUS_TOPIC)}
+    def follow(self) -> None:
+        """Join, and hear how sessions end."""
+        for peer in list(self._peers.values()):
+            if peer.state is not None and peer.state.sending.session:
+                self._follow(peer)
         for session in list(self.sessions.values()):
-            if session.source in sources:
-                session.seen_in_graph = True
-            elif session.seen_in_graph and session.final is None:
-                self._abandon(session, "broke off: its node has vanished")
-                continue
-            if session.final is not None and time.monotonic() - session.idle_since > PATIENCE:
-                self._abandon(session, "has ended without its last messages")
+            if session.instance not in self._peers:
+                if session.finished:
+                    del self.sessions[session.instance]
+                elif not session.has_ended:
+                    self._break(session, "has vanished")
+        for topic_input in self.inputs.values():
+            if (topic_input.in_session and not topic_input.sessions
+                    and not self.promised(topic_input.topic)):
+                topic_input.listen(False)
+        self._close_idle()
+
+    def promised(self, topic: str | None = None) -> bool:
+        """Whether a sender that is there has promised another session (of this topic)."""
+        return any(s.finished and s.said.event == NEXT and (topic is None or topic in s.topics)
+                   for s in self.sessions.values() if s.topics)
+
+    def report(self) -> None:
+        """Say now and then how much was taken."""
+        if time.monotonic() - self._report_at > REPORT_EVERY or self._unreported > REPORT_BYTES:
+            self._report_at, self._unreported = time.monotonic(), 0.0
+            self._reported = {topic: i.count for topic, i in self.inputs.items() if i.sessions}
+            self._say()
+
+    def take(self) -> Turn:
+        """One turn: all that waits on all topics."""
+        if self.woken and self.feeding():
+            time.sleep(NAP)
+        self.woken = False
+        turn = Turn()
+        if self._begun:
+            self._begun = False
+            turn.begun = sorted({t for s in self.feeding() for t in s.topics})
+        for topic, topic_input in self.inputs.items():
+            messages = topic_input.take()
+            if messages:
+                turn.blocks[topic] = messages
+                topic_input.heard_at = time.monotonic()
+                topic_input.count += len(messages)
+                self._unreported += len(messages) * len(messages[0][0])
+            if topic_input.is_complete():
+                turn.ended.append(topic)
+                turn.lost += self._compare(topic_input)
+        if turn.ended:
+            self._over += [s for s in self.feeding() if s.has_ended and s not in self._over
+                           and not any(s in self.inputs[t].sessions for t in s.topics)]
+            turn.lost += sum(self._lacks(s) for s in self._over)
+        turn.over = list(self._over)
+        if turn.over and len(turn.over) == len(self.feeding()):
+            turn.event = turn.over[-1].event
+        return turn
+
+    def done(self, sessions: list[Session]) -> None:
+        """Say that these sessions are finished."""
+        for session in sessions:
+            session.finished = True
+        self._over = [s for s in self._over if not s.finished]
+        if sessions:
+            self._report_at = float("-inf")
+            self.report()
+
+    def leave(self) -> None:
+        """The node stops, as it was asked to: nobody waits for it any more."""
+        for session in self.sessions.values():
+            session.finished = True
+        self._say()
+
+    def _follow(self, peer):
+        said = peer.state.sending
+        session = self.sessions.get(peer.instance)
+        if session is not None and session.id == said.session:
+            session.said = said
+        elif session is not None and not session.finished:
+            if not session.has_ended:
+                self._break(session, "was replaced by another")
+        elif said.event == BEGIN and self._own in said.company and not self._hold():
+            self._join(peer, said)
+
+    def _join(self, peer: Peer, said: Sending) -> None:
+        session = Session(said.session, peer.instance, peer.name, said, {})
+        session.topics = dict.fromkeys(said.topics, 0)
+        self._on_begin(session)
+        session.topics = {t: said.topics[t].sent for t in said.topics if t in self.inputs}
+        self.sessions[peer.instance] = session
+        for topic, count in session.topics.items():
+            topic_input = self.inputs[topic]
+            if not topic_input.in_session:
+                topic_input.take()
+                topic_input.listen(True)
+            if not topic_input.sessions:
+                topic_input.count = 0
+                self._reported.pop(topic, None)
+            topic_input.sessions.append(session)
+            topic_input.heard_at = time.monotonic()
+            late = count - said.topics[topic].before
+            topic_input.missed += late
+            session.late += late
+            self._name_others(topic, peer)
+        if session.topics:
+            self._begun = True
+            self._on_join()
+        self._say()
+
+    def _name_others(self, topic, peer):
+        names = sorted({i.node_name for i in self.node.get_publishers_info_by_topic(topic)
+                        if bytes(i.endpoint_gid).hex() != peer.state.sending.topics[topic].writer})
+        if names:
+            self.node.get_logger().warning(
+                f"{', '.join(names)} publishes {topic} beside {peer.name}: messages of both reach "
+                "this node and cannot be told apart")
+
+    def _break(self, session, why):
+        session.broken = True
+        if session.topics:
+            self._problem(f"the session of {session.source} broke off: it {why}")
+
+    def _lacks(self, session):
+        """What a session that is over lacks, beyond what was sent and not taken."""
+        if session.said.lost:
+            self._problem(f"{session.source} made its messages of incomplete data: it lacks "
+                          f"{session.said.lost} messages")
+        return session.said.lost + session.late + session.broken
+
+    def _compare(self, topic_input):
+        """At the end of all sessions of a topic: what was taken, and what they count.
+
+        Returns:
+            Number of messages lost.
+        """
+        expected, broken = topic_input.expected(), any(s.broken for s in topic_input.sessions)
+        topic_input.sessions = []
+        surplus = topic_input.count - expected
+        if surplus < 0:
+            topic_input.lost -= surplus
+            self._problem(f"{topic_input.topic}: {-surplus} of {expected} messages LOST")
+        elif surplus > 0 and not broken:
+            topic_input.unexpected += surplus
+            self._problem(f"{topic_input.topic}: {surplus} messages more than the {expected} "
+                          "of the session: somebody else publishes it, too")
+        return max(0, -surplus)
+
+    def _close_idle(self):
+        """Finish sessions of which nothing is taken."""
+        idle = [s for s in self.sessions.values() if s.has_ended and not s.topics
+                and not s.finished]
+        for session in idle:
+            session.finished = True
+        if idle:
+            self._say()

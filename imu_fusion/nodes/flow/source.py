@@ -1,343 +1,313 @@
-"""The publishing side of a session: :class:`FlowSource`."""
+"""The sending side of a session."""
 
 import time
 import uuid
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
-from imu_fusion.nodes.flow.protocol import (
-    ACK_EVERY,
-    ACK_QOS,
-    ACK_TOPIC,
-    BEGIN,
-    COMPANY,
-    DONE,
-    END,
-    RENEWED,
-    STATUS_OFFERED,
-    STATUS_TOPIC,
-    WINDOW,
-    full_name,
-    is_reliable,
-    reliable_qos,
-    status_message,
-    steady_timer,
-    type_name,
-)
+from imu_fusion.nodes.flow.peers import Peers
+from imu_fusion.nodes.flow.qos import full_name, gid, made, reliable_qos, type_name
+from imu_fusion.nodes.flow.state import BEGIN, END, MARK, Joined, Sending, Sent
 
-HEARSAY = 20.0  # s to discover a sink that another node knows; DDS forgets a dead one in 20 s
-_UNBOUNDED = float("inf")
-_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # rmw: endpoint discovered before its node's name
+WINDOW = 500  # messages sent before all must be acknowledged; half the depth of the queue
+WINDOW_BYTES = 16e6
+QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
+
+GETTING_KNOWN = 0.5  # s, in which a new subscriber may turn out to be one of our nodes
+
+AT_ONCE = Duration(nanoseconds=0)
+_LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
 
-class FlowPublisher:
-    """A publisher that counts, and keeps what the window does not admit in an outbox."""
+class Output:
+    """A publisher; in a session, what may not leave yet waits in ``waiting``."""
 
-    def __init__(self, source, publisher, name, msg_type, qos):
-        self.name = name  # before remapping
-        self.msg_type = msg_type
-        self.topic = publisher.topic_name
-        self.sent = 0  # equals the DDS sequence number of the last message
-        self.limit = _UNBOUNDED
-        self.outbox: deque = deque()
-        self.qos = qos
-        self._publisher = publisher
+    def __init__(self, source: "Source", msg_type: type, name: str, qos: QoSProfile) -> None:
+        self.msg_type, self.name = msg_type, name  # name before remapping
+        self.topic = source.node.resolve_topic_name(name)
+        self.waiting: deque = deque()
         self._source = source
-        self._look_at = 0
+        self._publisher: Publisher
+        self.writer = ""  # its gid
+        self.renew(qos)
 
-    @property
-    def is_open(self):
-        """Whether a message would leave at once."""
-        return self.sent < self.limit
-
-    def publish(self, message):
-        """Send a message (or its CDR bytes) now, or as soon as the window admits it."""
-        if self.sent >= self.limit:
-            self.outbox.append(message)
-            return
-        self._publisher.publish(message)
-        self.sent += 1
-        if self.sent >= self._look_at:
-            self._look_at = self.sent + ACK_EVERY
-            self._source.look_for_joiners()
-
-    def renew(self, qos):
+    def renew(self, qos: QoSProfile) -> None:
         """Begin anew, between sessions: what was latched is forgotten."""
-        self._publisher = self._source.exchange(self, self._publisher, qos)
-        self.qos, self.sent, self._look_at = qos, 0, 0
+        node = self._source.node
+        if self.writer:
+            node.destroy_publisher(self._publisher)
+        self._publisher, self.writer = made(
+            node.get_publishers_info_by_topic, self.topic,
+            lambda: node.create_publisher(self.msg_type, self.name, qos), self._source.participant)
+        self.qos = qos
+        self.sent = self.start = self.bytes = 0
+        self._flight = self._flight_bytes = 0
 
-    def matched(self):
+    def publish(self, message: Any) -> None:
+        """Send a message (or its CDR bytes) now, or as soon as it may leave."""
+        if self.waiting or not self.is_open():
+            self.waiting.append(message)
+        else:
+            self._send(message)
+
+    def is_open(self) -> bool:
+        """Whether a message would leave at once."""
+        if self._source.phase != _OPEN:
+            return self._source.phase == _LIVE
+        if self._flight < WINDOW and self._flight_bytes < WINDOW_BYTES:
+            return True
+        taken = self._source.taken(self.topic)
+        if taken is not None and (self.sent - taken) * self.bytes > QUEUED_BYTES * self.sent:
+            return False
+        if self.acknowledged():
+            self._flight = self._flight_bytes = 0
+            return True
+        return False
+
+    def acknowledged(self) -> bool:
+        """Whether everything is in the queue of each reader, or was taken by all of ours."""
+        if self._publisher.wait_for_all_acked(AT_ONCE):
+            return True
+        taken = self._source.taken(self.topic)
+        return taken is not None and taken >= self.sent
+
+    def matched(self) -> int:
         """Number of subscriptions that get what is published now."""
         return self._publisher.get_subscription_count()
 
-    def drain(self):
-        while self.outbox and self.sent < self.limit:
-            self.publish(self.outbox.popleft())
+    def drain(self) -> None:
+        """Send what waits, as far as it may leave."""
+        while self.waiting and self.is_open():
+            self._send(self.waiting.popleft())
+
+    def _send(self, message):
+        self._publisher.publish(message)
+        self.sent += 1
+        if isinstance(message, bytes | memoryview):
+            self._flight_bytes += len(message)
+            self.bytes += len(message)
+        self._flight += 1
 
 
-@dataclass
-class _Consumer:
-    """What a source knows of one of our sinks."""
-
-    joined: dict  # topic -> sent when it joined
-    acked: dict = field(default_factory=dict)  # topic -> sequence number
-    lost: dict = field(default_factory=dict)
-    since: float = 0.0
-    answered: bool = False
-    done: bool = False
-
-    def position(self, topic):
-        return max(self.acked[topic], self.joined.get(topic, 0))
-
-
-class FlowSource:
-    """The publishing side: announces sessions and keeps to the window.
+class Source:
+    """What a node sends.
 
     Args:
-        node: the rclpy node.
-        wait_for: names of nodes that must answer before the first message.
-        window: unacknowledged messages per topic and consumer.
-        on_ready: called whenever acknowledgements may have opened the window.
+        peers: the other instances.
+        own: topic of this node's state, its instance; ``participant``: how its gids begin.
+        wait_for: names of nodes that must have joined before the first message.
+        upstream: returns the instances that those know whose sessions this node processes.
+        say: called when :attr:`sending` has changed.
+        problem: called with a text for the user.
     """
 
-    def __init__(self, node, *, wait_for=(), window=WINDOW, on_ready=lambda: None):
-        self._node = node
-        self._name = node.get_fully_qualified_name()
-        self._window = window
-        self._on_ready = on_ready
+    def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
+                 wait_for: Collection[str], upstream: Callable[[], set[str]],
+                 say: Callable[[], None], problem: Callable[[str], None]) -> None:
+        self.node, self.participant = node, participant
+        self.outputs: dict[str, Output] = {}
+        self.phase = _LIVE
+        self.lost = 0  # see Sending
+        self.foreign: dict[str, list[str]] = {}
+        self._foreign_since: dict[str, float] = {}
+        self._peers, self._own = peers, own
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
-        self._publishers = {}
-        self._consumers = {}
-        self._seen = set()
-        self._matched = None
-        self._settling = False
-        self._begin_after_drain = False
-        self._company = set()
-        self._start = {}
-        self._renewed = set()  # topics whose sequence numbers have begun anew
-        self._ending = None  # the event that ends the session
-        self._announced = False
-        self.session = None
-        self.foreign = {}
-        self._status = node.create_publisher(DiagnosticStatus, STATUS_TOPIC, STATUS_OFFERED)
-        node.create_subscription(DiagnosticStatus, ACK_TOPIC, self._on_ack, ACK_QOS)
-        steady_timer(node, 0.1, self._watch)
+        self._upstream, self._say, self._problem = upstream, say, problem
+        self._session = ""
+        self.company: set[str] = set()  # instances that must have joined
+        self._version = 0
+        self._takers: dict[str, tuple[str, Joined]] = {}  # instance -> name, what it said last
+        self._event = ""  # with which the session is to end
+        self._begin_after = False
 
-    def publisher(self, msg_type, topic, qos=None):
-        """Make a :class:`FlowPublisher`; all of them before the session begins."""
-        qos = qos or reliable_qos()
-        publisher = FlowPublisher(
-            self, self._node.create_publisher(msg_type, topic, qos), topic, msg_type, qos)
-        self._publishers[publisher.topic] = publisher
-        return publisher
+    def output(self, msg_type: type, topic: str, qos: QoSProfile | None = None) -> Output:
+        """A new :class:`Output`; all of them before the session begins."""
+        output = Output(self, msg_type, topic, qos or reliable_qos())
+        self.outputs[output.topic] = output
+        return output
 
-    def exchange(self, publisher, old, qos):
-        """A new rclpy publisher in place of an old one; see :meth:`FlowPublisher.renew`."""
-        self._renewed.add(publisher.topic)
-        self._node.destroy_publisher(old)
-        return self._node.create_publisher(publisher.msg_type, publisher.name, qos)
+    def sending(self) -> Sending:
+        """What is said of the session."""
+        if not self._session:
+            return Sending()
+        return Sending(
+            self._session, self._event if self.phase == _ENDED else BEGIN,
+            {topic: Sent(type_name(o.msg_type), o.writer, o.start, o.sent)
+             for topic, o in self.outputs.items()}, frozenset(self.company),
+            self._version, self.lost)
 
-    def begin(self, company=()):
-        """Announce a session; :meth:`ready` turns true when all sinks have answered.
-
-        Args:
-            company: names of sinks that somebody else has seen in the graph.
-        """
-        self._company = set(company) - {self._name}
-        if self.session is not None and not self.drained():
-            self._begin_after_drain = True
+    def begin(self) -> None:
+        """Announce a session, now or when the last one is over."""
+        if self.phase != _LIVE:
+            self._begin_after = True
             return
-        self.session = f"{self._name}#{uuid.uuid4().hex[:12]}"
-        self._begin_after_drain = False
-        self._ending = None
-        self._announced = False
-        self._matched = None
-        self._consumers = {}
-        self._start = {topic: p.sent for topic, p in self._publishers.items()}
-        self._settling = True
-        self._close_windows()
-        for name in self._wait_for | self._company:
-            self._expect(name)
-        self._refresh()
-        self._announce()
+        self._begin_after, self._event, self._session = False, "", uuid.uuid4().hex[:12]
+        self.company, self._takers, self.lost = set(), {}, 0
+        for output in self.outputs.values():
+            output.start = output.sent
+        self.phase = _JOINING
+        self._peers.look()
+        self.look(anew=True)
 
-    def expect(self, company):
-        """More sinks have been seen by somebody else: they must answer too."""
-        self._company |= set(company) - {self._name}
-        new = self._company - self._consumers.keys()
-        if new and self.session is not None and not (self._announced or self._begin_after_drain):
-            for name in new:
-                self._expect(name)
-            self._announce()
+    def end(self, event: str = END) -> None:
+        """End the session when everything has left; ``NEXT`` promises another one."""
+        if self.phase in (_JOINING, _OPEN) and not self._event:
+            self._event = event
+            self.advance()
 
-    def ready(self):
-        """Whether every topic may send (always, outside sessions)."""
-        if self._settling or self._begin_after_drain:
-            return False
-        return all(publisher.sent < publisher.limit for publisher in self._publishers.values())
+    def ready(self) -> bool:
+        """Whether every topic may send (always, without a session)."""
+        return not self._begin_after and all(
+            not output.waiting and output.is_open() for output in self.outputs.values())
 
-    def end(self, event=END):
-        """End the session once all outboxes are empty; ``NEXT`` promises another one."""
-        if self.session is not None and self._ending is None:
-            self._ending = event
-            self._announce_end()
+    def is_settled(self) -> bool:
+        """Whether a session is open which all have joined."""
+        return self.phase == _OPEN and not self._begin_after
 
-    def drained(self):
-        """Whether the session has ended and its consumers have everything (or vanished)."""
-        return self.session is None or (self._announced and all(
-            c.done or (c.answered and not c.acked) for c in self._consumers.values()))
+    def is_shut(self) -> bool:
+        """Whether something waits for acknowledgements, whose coming wakes nobody."""
+        return self.phase == _OPEN and (bool(self._event) or not self.ready())
 
-    def waiting_for(self):
-        """Who keeps the source from sending, in words; '' if nobody does."""
-        unanswered = sorted(n for n, c in self._consumers.items() if not c.answered)
-        if unanswered:
-            return "no answer yet from " + ", ".join(unanswered)
-        if self._settling:
-            return "discovery is not complete"
-        slow = sorted(name for name, consumer in self._consumers.items() if any(
-            consumer.position(t) + self._window <= self._publishers[t].sent
-            for t in consumer.acked) or (self._announced and consumer.acked and not consumer.done))
-        return "no acknowledgement from " + ", ".join(slow) if slow else ""
+    def drained(self) -> bool:
+        """Whether no session is open: all who joined have everything."""
+        return self.phase == _LIVE
 
-    def acknowledged(self, topic):
-        """The number up to which all consumers of ``topic`` have acknowledged; None: nobody."""
-        return min((c.position(topic) for c in self._consumers.values() if topic in c.acked),
+    def taken(self, topic: str) -> int | None:
+        """How far all who joined have taken a topic; None: nobody takes it."""
+        return min((joined.topics[topic].taken for joined in self._answers().values()
+                    if joined is not None and topic in joined.topics and not joined.finished),
                    default=None)
 
-    def report(self):
-        """{topic: (messages sent, {consumer: messages it lost})} of our consumers."""
-        return {topic: (publisher.sent, {
-            name: consumer.lost[topic] for name, consumer in sorted(self._consumers.items())
-            if topic in consumer.acked}) for topic, publisher in self._publishers.items()}
+    def report(self) -> dict[str, tuple[int, dict[str, int]]]:
+        """{topic: (messages sent, {name of a node that took it: messages that it lost})}."""
+        return {topic: (output.sent, {
+            name: joined.topics[topic].lost for name, joined in self._takers.values()
+            if topic in joined.topics}) for topic, output in self.outputs.items()}
 
-    def look_for_joiners(self):
-        """Notice new subscriptions early, so that they cannot fall behind by a queue."""
-        if self.session is not None and not self._announced:
-            matched = [p.matched() for p in self._publishers.values()]
-            if matched != self._matched:
-                self._matched = matched
-                if self._refresh():
-                    self._announce()
+    def waiting_for(self) -> str:
+        """Who keeps the source from sending or ending, in words; '' if nobody does."""
+        if self.phase == _JOINING:
+            names = {peer.name for peer in self._peers.values() if peer.is_silent}
+            names |= {instance.partition(MARK)[0] for instance in self._waiting()}
+            names |= self._wait_for - self._names()
+            return ("no answer yet from " + ", ".join(sorted(names)) if names
+                    else "discovery is not complete")
+        if self.phase == _LIVE:
+            return ""
+        slow = sorted({self._peers[i].name for i, j in self._answers().items() if j is not None
+                       and not j.finished and (self.phase == _ENDED or any(
+                           t in self.outputs and taken.taken < self.outputs[t].sent
+                           for t, taken in j.topics.items()))})
+        slow += sorted({n for topic, names in self.foreign.items() for n in names
+                        if not self.outputs[topic].is_open()})
+        return "not taken yet by " + ", ".join(slow) if slow else ""
 
-    def _expect(self, name):
-        self._consumers[name] = _Consumer(
-            {t: p.sent for t, p in self._publishers.items()}, since=time.monotonic())
-        self._settling = True
-        self._close_windows()
+    def look(self, anew: bool = False) -> None:
+        """Compare with the graph: who listens, who has come, who has gone."""
+        self.foreign = self._strangers()
+        names = {name for names in self.foreign.values() for name in names}
+        self._foreign_since = {n: self._foreign_since.get(n, time.monotonic()) for n in names}
+        if self.phase in (_JOINING, _OPEN):
+            known = self._upstream() | {
+                p.instance for p in self._peers.values() if p.state and p.state.listens}
+            if anew or known - self.company:
+                self.company |= known
+                self._version += 1
+                self.phase = _JOINING
+                self._say()
+        else:
+            known = self.company & self._peers.keys()
+        for instance in self.company - known:
+            self.company.discard(instance)
+            name, joined = self._takers.get(instance, ("", None))
+            if (joined is not None and joined.topics and not joined.finished
+                    and any(output.sent > output.start for output in self.outputs.values())):
+                self._problem(f"{name} has vanished in mid-session")
+            if self.phase != _ENDED:
+                self._say()
+        self.advance()
 
-    def _announce(self):
-        values = {topic: f"{sent} {type_name(self._publishers[topic].msg_type)}"
-                  + (f" {RENEWED}" if topic in self._renewed else "")
-                  for topic, sent in self._start.items()}
-        values[COMPANY] = " ".join(sorted(self._consumers))
-        self._status.publish(status_message(self._name, self.session, BEGIN, values))
+    def advance(self) -> None:
+        """Do what has become possible: open, send what waits, end, begin the next."""
+        if self.phase == _LIVE:
+            return
+        for instance, joined in self._answers().items():
+            if joined is not None:
+                self._takers[instance] = self._peers[instance].name, joined
+        if self.phase == _JOINING and self._all_joined():
+            self.phase = _OPEN
+            self._say()
+        if self.phase == _OPEN:
+            for output in self.outputs.values():
+                output.drain()
+            if self._event and all(not output.waiting and output.acknowledged()
+                                   for output in self.outputs.values()):
+                self.phase = _ENDED
+                self._say()
+        if self.phase == _ENDED and all(j is not None and j.finished
+                                        for j in self._answers().values()):
+            self._close()
 
-    def _close_windows(self):
-        for publisher in self._publishers.values():
-            publisher.limit = publisher.sent
+    def _close(self):
+        self.phase = _LIVE
+        for name, joined in self._takers.values():
+            lost = {topic: taken.lost for topic, taken in joined.topics.items() if taken.lost}
+            if lost:
+                self._problem(f"{name} lost " + ", ".join(f"{n} of {t}" for t, n in lost.items()))
+        for output in self.outputs.values():
+            output.drain()
+        if self._begin_after:
+            self.begin()
 
-    def _refresh(self):
-        """Compare consumers with the graph: joined, vanished, foreign.
+    def _answers(self):
+        """What each of the company says of this session; None: nothing yet."""
+        answers = {}
+        for instance in self.company:
+            peer = self._peers.get(instance)
+            joined = peer.state.joined.get(self._own) if peer and peer.state else None
+            answers[instance] = joined if joined and joined.session == self._session else None
+        return answers
 
-        Returns:
-            Whether sinks have joined.
-        """
-        names = [full_name(i) for i in self._node.get_publishers_info_by_topic(ACK_TOPIC)
-                 if i.node_name != _UNKNOWN_NODE]
-        sinks = set(names) - {self._name}
-        if len(names) > len(set(names)):
-            self._node.get_logger().warning(
-                "several nodes have the same name; their acknowledgements cannot be told apart: "
-                + ", ".join(sorted(n for n in sinks if names.count(n) > 1))
-                + "; rename all but one with -r __node:=NAME", once=True)
-        self._seen |= sinks
-        new = sinks - self._consumers.keys()
-        if self._announced:
-            new = set()
-        for name in new:
-            self._expect(name)
-        for name in self._consumers.keys() - sinks:
-            heard_of = time.monotonic() - self._consumers[name].since
-            if name in self._seen or (name not in self._wait_for and heard_of > HEARSAY):
-                if not self._consumers[name].done:
-                    self._node.get_logger().warning(f"{name} has vanished")
-                    del self._consumers[name]
-                self._seen.discard(name)
-        self.foreign = {}
-        for topic in self._publishers:
-            others = {full_name(i) for i in self._node.get_subscriptions_info_by_topic(topic)
-                      if i.node_name != _UNKNOWN_NODE}
-            others -= sinks | {self._name} | self._consumers.keys()
-            if others:
-                self.foreign[topic] = sorted(others)
-        return bool(new)
+    def _waiting(self):
+        """Those of the company that are not ready with the company as it is now."""
+        return {instance for instance, joined in self._answers().items()
+                if joined is None or joined.version < self._version and not joined.finished}
 
-    def _is_settled(self):
-        """All have answered, and the subscriptions they speak of are reliable and matched."""
-        if not all(c.answered for c in self._consumers.values()):
+    def _names(self):
+        return {self._peers[i].name for i, j in self._answers().items() if j is not None}
+
+    def _all_joined(self):
+        """All have answered, and the readers that they speak of are matched."""
+        if (self._waiting() or self._wait_for - self._names()
+                or any(peer.is_silent for peer in self._peers.values())
+                or any(time.monotonic() - since < GETTING_KNOWN
+                       for since in self._foreign_since.values())):
             return False
-        for topic, publisher in self._publishers.items():
-            infos = self._node.get_subscriptions_info_by_topic(topic)
-            listening = {full_name(i): is_reliable(i.qos_profile) for i in infos}
-            if not all(listening.get(name) for name, c in self._consumers.items()
-                       if topic in c.acked):
+        for topic, output in self.outputs.items():
+            infos = self.node.get_subscriptions_info_by_topic(topic)
+            if {j.topics[topic].reader for j in self._answers().values()
+                    if topic in j.topics and not j.finished} - set(map(gid, infos)):
                 return False
-            compatible = sum(
-                qos_check_compatible(publisher.qos, i.qos_profile)[0] != QoSCompatibility.ERROR
-                for i in infos)
-            if publisher.matched() < compatible:
+            compatible = sum(qos_check_compatible(output.qos, i.qos_profile)[0]
+                             != QoSCompatibility.ERROR for i in infos)
+            if output.matched() < compatible:
                 return False
         return True
 
-    def _watch(self):
-        if self.session is not None:
-            if self._refresh():
-                self._announce()
-            self._update()
-
-    def _on_ack(self, message):
-        if message.hardware_id != self.session or message.name == self._name:
-            return
-        if message.name not in self._consumers:
-            self._expect(message.name)
-            if not self._announced:
-                self._announce()
-        consumer = self._consumers[message.name]
-        consumer.answered = True
-        consumer.done = message.message == DONE
-        for entry in message.values:
-            if entry.key in self._publishers:
-                acked, lost = entry.value.split()
-                # A sink that heard another writer of this topic before may be ahead.
-                consumer.acked[entry.key] = min(int(acked), self._publishers[entry.key].sent)
-                consumer.lost[entry.key] = int(lost)
-        self._update()
-
-    def _update(self):
-        """Open the windows as far as the acknowledgements allow, and send what waits."""
-        if self._settling:
-            if not self._is_settled():
-                return
-            self._settling = False
-        for topic, publisher in self._publishers.items():
-            position = self.acknowledged(topic)
-            publisher.limit = _UNBOUNDED if position is None else position + self._window
-            publisher.drain()
-        self._announce_end()
-        if self._announced and self.drained():
-            self.session = None
-            for publisher in self._publishers.values():
-                publisher.limit = _UNBOUNDED
-            if self._begin_after_drain:
-                self.begin(self._company)
-        self._on_ready()
-
-    def _announce_end(self):
-        if self._ending and not self._announced and not any(
-                p.outbox for p in self._publishers.values()):
-            self._status.publish(status_message(self._name, self.session, self._ending, {
-                p.topic: str(p.sent) for p in self._publishers.values()}))
-            self._announced = True
+    def _strangers(self):
+        """{topic: names of nodes that subscribe and are not ours}."""
+        ours = {peer.name for peer in self._peers.values() if peer.state}
+        ours.add(self.node.get_fully_qualified_name())
+        found = {}
+        for topic in self.outputs:
+            others = {full_name(i) for i in self.node.get_subscriptions_info_by_topic(topic)
+                      if i.node_name != "_NODE_NAME_UNKNOWN_"} - ours
+            if others:
+                found[topic] = sorted(others)
+        return found
