@@ -265,7 +265,8 @@ def _begin_step(s, p, stamp, sample, eq):
 
 @njit
 def _weigh_mags(s, p, eq):
-    """The magnetometer samples that came, as the field's part of the equation. Returns B0, T."""
+    """The magnetometer samples that came, as the field's part of the equation, with the weight of
+    (10). Returns B0, T."""
     step, expected = s.step, s.printed.field_world
     b0 = math.sqrt(expected[0] ** 2 + expected[1] ** 2 + expected[2] ** 2)
     taken = np.empty(s.queue.count, mag_queue.TAKEN)
