@@ -30,7 +30,8 @@ NAMES_ALONE = {"imu_fusion": 0, "make": 0, "pip": 0, "python": 1, "ros2": 2}
 # Programs of others: only that they exist in this world is known.
 FOREIGN = {"git", "cd", "source", "rosdep", "colcon", "python3", "chromium", "sudo"}
 # Not of a stage: those of the nodes' flow control, of the clock and of recordings in bags/.
-TOPICS = {"clock", "diagnostics", "<node>/_flow/<instance>", "recorder/summary", "reference/pose", "reference/moving",
+TOPICS = {"clock", "diagnostics", "<node>/_flow/<instance>", "recorder/summary",
+          "reference/pose", "reference/moving",
           "reference/jump", "onboard_ekf/pose", "accelerometers/<name>"}
 
 

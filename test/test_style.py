@@ -68,3 +68,29 @@ def test_the_checks_find_what_they_look_for():
     body = "    x = 1\n" * LONGEST
     assert too_long(f"def f():\n{body}") == ["f"]
     assert not too_long(f"# long: a table\n@cache\ndef f():\n{body}")
+
+
+def loose_records(source):
+    """Kernels that keep one record in an array of their own: numba frees the array after its last
+    use, though the record is still in use. It comes from the caller, or is part of a state."""
+    found = []
+    for name, function in functions(ast.parse(source)):
+        for node in ast.walk(function) if is_kernel(function) else ():
+            made = node.value if isinstance(node, ast.Assign) else None
+            if (isinstance(made, ast.Call) and isinstance(made.func, ast.Attribute)
+                    and made.func.attr in ("zeros", "empty") and len(made.args) == 2
+                    and ast.unparse(made.args[0]) in ("1", "(1,)")):
+                found.append(f"{name}: {ast.unparse(made)}")
+    return found
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(PACKAGE)))
+def test_no_kernel_makes_records_of_its_own(file):
+    assert not loose_records(file.read_text())
+
+
+def test_loose_records_are_found():
+    assert loose_records("@njit\ndef f():\n    rows = np.empty(1, es.ROW)\n    r = rows[0]") == [
+        "f: np.empty(1, es.ROW)"]
+    assert not loose_records("@njit\ndef f(n):\n    return np.empty(1, ROW), np.zeros(n, ROW)")
+    assert not loose_records("def f():\n    rows = np.empty(1, ROW)")

@@ -139,8 +139,6 @@ def test_kernels_are_compiled_before_any_node_starts(tmp_path, monkeypatch, caps
     assert not started and capsys.readouterr().err == "compiling for this machine\n"
 
 
-
-
 def test_a_node_closes_its_files_when_asked_to_end(tmp_path, monkeypatch, capsys):
     """A recorder without a session never ends by itself. What nodes say into their logs while
     they compile is passed on."""

@@ -68,24 +68,6 @@ def initialise(state: np.ndarray, alignment: Alignment) -> None:
         cov[:3, 6:] = cov[6:, :3].T
 
 
-EQUATION = np.dtype([
-    ("rate", "f8", 3), ("rate_next", "f8", 3),   # rad/s at both ends, each in its own imu axes
-    ("dt", "f8"),             # s
-    ("field", "f8", 3),       # expected field / B0, in the axes of the step's start
-    ("mag", "f8", 3),         # measured field / B0, in the axes of its end
-    ("weight", "f8"),         # w of (10), 0 without a sample
-    # Weight of each gyroscope axis: 1, or next to nothing. Not 0: a missing axis along the field is
-    # in no other row.
-    ("keep", "f8", 3),
-], align=True)
-"""The least-squares problem (9) of one step.
-
-The paper writes (9) in world axes; turned into those of the step's start it
-is the same least-squares problem with R_n = I. There a gyroscope axis is a row, which
-``keep`` can leave out where the axis is at its limit (appendix B).
-"""
-
-
 @njit
 def _inverse3(m):
     """Inverse of a (3, 3) matrix by its adjugate."""
@@ -132,7 +114,7 @@ def solve_step(eq, gain):
     """Rotation over one step in the axes of its start: Winkler 2025 (9), Gauss-Newton.
 
     Args:
-        eq: an EQUATION.
+        eq: a state.EQUATION.
         gain: (3, 3) out, attitude correction (axes of the start) per magnetic residual.
 
     Returns:
@@ -227,8 +209,7 @@ def step(s, p, stamp, sample, row):
     """One Imu sample through the method as printed; see fusion.step. Returns 0 or 1."""
     if imu_rejection.is_refused(s, stamp, sample):
         return 0
-    equations = np.empty(1, EQUATION)
-    eq = equations[0]
+    eq = s.printed.equation
     gap_variance = _begin_step(s, p, stamp, sample, eq)
     b0 = _weigh_mags(s, p, eq)
     step, printed = s.step, s.printed

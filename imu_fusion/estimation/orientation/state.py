@@ -8,7 +8,7 @@ records of their own. Rates are rad/s in imu axes, specific forces m/s^2, stamps
 
 import numpy as np
 
-from imu_fusion.estimation.orientation.error_state import PREDICTION, N
+from imu_fusion.estimation.orientation.error_state import PREDICTION, ROW, N
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
 QUEUE_LENGTH = 128    # samples that wait: at 1 kHz more than the largest delay, 0.1 s
@@ -100,10 +100,29 @@ COUNTS = np.dtype([(name, "i8") for name in COUNT_NAMES], align=True)
 """What became of the samples: used; refused as impossible, out of order or too many; too late;
 disturbed; with an axis at its limit; steps with a gap; Imu samples at a limit; rates held."""
 
+EQUATION = np.dtype([
+    ("rate", "f8", 3), ("rate_next", "f8", 3),   # rad/s at both ends, each in its own imu axes
+    ("dt", "f8"),             # s
+    ("field", "f8", 3),       # expected field / B0, in the axes of the step's start
+    ("mag", "f8", 3),         # measured field / B0, in the axes of its end
+    ("weight", "f8"),         # w of (10), 0 without a sample
+    # Weight of each gyroscope axis: 1, or next to nothing. Not 0: a missing axis along the field is
+    # in no other row.
+    ("keep", "f8", 3),
+], align=True)
+"""The least-squares problem (9) of one step.
+
+The paper writes (9) in world axes; turned into those of the step's start it
+is the same least-squares problem with R_n = I. There a gyroscope axis is a row, which
+``keep`` can leave out where the axis is at its limit (appendix B).
+"""
+
 PRINTED = np.dtype([
     ("field_world", "f8", 3),            # T
     ("cov", "f8", (9, 9)),               # attitude (world axes), bias, field relative to its norm
     ("was_clipped", "i8"),               # bits of the axes at their limit at the step's start
+    # Here and not made in each step: a numba record does not keep its array alive.
+    ("equation", EQUATION),
 ], align=True)
 """Of Winkler's method as printed alone (gyro_mag)."""
 
@@ -150,6 +169,7 @@ STATE = np.dtype([
     ("was_clipped", "i8"),               # the same at the end of the block before
     ("slope", "f8", 3),                  # rad/s^2, the last that each axis showed within its limit
     ("step", STEP),
+    ("row", ROW),                        # of the measurement of the first magnetometer sample
     ("printed", PRINTED),
 ], align=True)
 """The whole state, zeroed at the start."""

@@ -62,8 +62,7 @@ def _share_errors(s, p, b, has_heading, follow):
     """Updates that make field, attitude and calibration share the first sample's error."""
     r = quat_to_matrix(s.quat_world_imu)
     m = quat_rotate_inverse(s.quat_world_imu, b)
-    rows = np.empty(1, es.ROW)
-    row = rows[0]
+    row = s.row    # of the state: a numba record does not keep an array of its own alive
     error = np.zeros(es.N)
     no_tape = np.empty(0, es.TAPE)
     row.residual, row.variance = 0.0, _FIRST_FIELD_SD ** 2
