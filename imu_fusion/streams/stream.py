@@ -97,6 +97,7 @@ class Stream:
         self.frame_ids: dict[str, str] = {}
         self.restarts = 0
         self._first: dict[str, list[Samples]] = {topic: [] for topic in self.inputs}
+        self._seen = dict.fromkeys(self.inputs, 0)  # samples so far, until there are enough
         self.restart()
 
     def take(self, blocks: Mapping[str, Sequence[bytes]]) -> list[Messages]:
@@ -182,8 +183,9 @@ class Stream:
         if self.concludes:
             return    # whole logs are looked at instead
         first = self._first[topic]
-        seen = sum(len(stamps) for stamps, _ in first)
+        seen = self._seen[topic]
         if seen < _LOOK_AT:
+            self._seen[topic] += len(stamp)
             first.append((stamp[:_LOOK_AT - seen], values[:_LOOK_AT - seen]))
             if seen + len(stamp) >= _LOOK_AT:
                 for text in self.look_at(topic, self._first_logs()):

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from imu_fusion.nodes.flow.peers import Peers
-from imu_fusion.nodes.flow.qos import PARTICIPANT, made, steady_timer
+from imu_fusion.nodes.flow.qos import PARTICIPANT, SILENT, made, steady_timer
 from imu_fusion.nodes.flow.sink import Input, Session, Sink, Turn
 from imu_fusion.nodes.flow.source import AT_ONCE, Output, Source
 from imu_fusion.nodes.flow.state import END, MARK, STATE_QOS, State
@@ -47,7 +47,7 @@ class Flow:
         self._node, self._listens, self._relays = node, listens, relays
         own = f"{node.get_fully_qualified_name()}{MARK}i{uuid.uuid4().hex[:12]}"
         self._publisher, gid = made(node.get_publishers_info_by_topic, own, lambda: (
-            node.create_publisher(DiagnosticArray, own, STATE_QOS)))
+            node.create_publisher(DiagnosticArray, own, STATE_QOS, event_callbacks=SILENT)))
         self.peers = Peers(node, own, self._changed, self._problem)
         self.source = Source(
             node, self.peers, own, gid[:PARTICIPANT], wait_for=wait_for, say=self._say,
@@ -107,6 +107,8 @@ class Flow:
 
     def close(self) -> None:
         """The node stops: whoever listens is told that nothing more comes, and time to hear it."""
+        if self._relays and any(not session.has_ended for session in self.sink.feeding()):
+            self.source.lost += 1  # at least: its senders go on
         self.source.end(END)
         self.sink.leave()
         deadline = time.monotonic() + _LAST_WORDS

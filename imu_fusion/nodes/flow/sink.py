@@ -326,7 +326,7 @@ class Sink:
         """What a session that is over lacks, beyond what was sent and not taken."""
         if session.said.lost:
             self._problem(f"{session.source} made its messages of incomplete data: it lacks "
-                          f"{session.said.lost} messages")
+                          f"at least {session.said.lost} messages")
         return session.said.lost + session.late + session.broken
 
     def _compare(self, topic_input):

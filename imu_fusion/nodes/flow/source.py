@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
 from imu_fusion.nodes.flow.peers import Peers
-from imu_fusion.nodes.flow.qos import full_name, gid, made, reliable_qos, type_name
+from imu_fusion.nodes.flow.qos import SILENT, full_name, gid, made, reliable_qos, type_name
 from imu_fusion.nodes.flow.state import BEGIN, END, MARK, Joined, Sending, Sent
 
 WINDOW = 500  # messages sent before all must be acknowledged; half the depth of the queue
@@ -44,7 +44,8 @@ class Output:
             node.destroy_publisher(self._publisher)
         self._publisher, self.writer = made(
             node.get_publishers_info_by_topic, self.topic,
-            lambda: node.create_publisher(self.msg_type, self.name, qos), self._source.participant)
+            lambda: node.create_publisher(self.msg_type, self.name, qos, event_callbacks=SILENT),
+            self._source.participant)
         self.qos = qos
         self.sent = self.start = self.bytes = 0
         self._flight = self._flight_bytes = 0
@@ -163,7 +164,7 @@ class Source:
 
     def ready(self) -> bool:
         """Whether every topic may send (always, without a session)."""
-        return not self._begin_after and all(
+        return self.phase == _LIVE or not self._begin_after and all(
             not output.waiting and output.is_open() for output in self.outputs.values())
 
     def is_settled(self) -> bool:
