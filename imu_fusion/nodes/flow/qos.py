@@ -12,8 +12,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 E = TypeVar("E")
 
-# The executor looks at each event of each publisher in each turn, and most of a live node's time goes
-# there. What they tell of, QoS that do not match, a subscription tells as well.
+# The executor looks at each event of each publisher in each turn, and most of a live node's time
+# goes there. What they tell of, QoS that do not match, a subscription tells as well.
 SILENT = PublisherEventCallbacks(use_default_callbacks=False)
 
 DEPTH = 1000  # queue depth of writers, and of readers outside sessions

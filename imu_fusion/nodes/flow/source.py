@@ -19,8 +19,9 @@ WINDOW = 500  # messages sent before all must be acknowledged; half the depth of
 WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
-GETTING_KNOWN = 0.5  # s, in which a new subscriber may turn out to be one of our nodes
+GETTING_KNOWN = 1.0  # s, in which a new subscriber may turn out to be one of our nodes
 
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # as rmw calls it
 AT_ONCE = Duration(nanoseconds=0)
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
@@ -116,7 +117,7 @@ class Source:
         self.phase = _LIVE
         self.lost = 0  # see Sending
         self.foreign: dict[str, list[str]] = {}
-        self._foreign_since: dict[str, float] = {}
+        self._unknown_since: dict[str, float] = {}  # gid of a reader -> time
         self._peers, self._own = peers, own
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
         self._upstream, self._say, self._problem = upstream, say, problem
@@ -211,9 +212,7 @@ class Source:
 
     def look(self, anew: bool = False) -> None:
         """Compare with the graph: who listens, who has come, who has gone."""
-        self.foreign = self._strangers()
-        names = {name for names in self.foreign.values() for name in names}
-        self._foreign_since = {n: self._foreign_since.get(n, time.monotonic()) for n in names}
+        self._look_for_strangers()
         if self.phase in (_JOINING, _OPEN):
             known = self._upstream() | {
                 p.instance for p in self._peers.values() if p.state and p.state.listens}
@@ -288,7 +287,7 @@ class Source:
         if (self._waiting() or self._wait_for - self._names()
                 or any(peer.is_silent for peer in self._peers.values())
                 or any(time.monotonic() - since < GETTING_KNOWN
-                       for since in self._foreign_since.values())):
+                       for since in self._unknown_since.values())):
             return False
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
@@ -301,14 +300,18 @@ class Source:
                 return False
         return True
 
-    def _strangers(self):
-        """{topic: names of nodes that subscribe and are not ours}."""
+    def _look_for_strangers(self):
+        """Find out who subscribes and is not, or not yet, known as one of ours."""
         ours = {peer.name for peer in self._peers.values() if peer.state}
         ours.add(self.node.get_fully_qualified_name())
-        found = {}
+        self.foreign, since = {}, {}
         for topic in self.outputs:
-            others = {full_name(i) for i in self.node.get_subscriptions_info_by_topic(topic)
-                      if i.node_name != "_NODE_NAME_UNKNOWN_"} - ours
-            if others:
-                found[topic] = sorted(others)
-        return found
+            others = [info for info in self.node.get_subscriptions_info_by_topic(topic)
+                      if full_name(info) not in ours]
+            since |= {gid(info): time.monotonic() for info in others}
+            # A node's endpoints are discovered before its name.
+            names = {full_name(info) for info in others if info.node_name != UNKNOWN_NODE}
+            if names:
+                self.foreign[topic] = sorted(names)
+        self._unknown_since = since | {
+            g: t for g, t in self._unknown_since.items() if g in since}
