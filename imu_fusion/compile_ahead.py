@@ -39,6 +39,25 @@ def _orientation() -> None:
                 estimator.add_mag(int(mag.stamp[i]), mag.mag[i])
                 estimator.add_imu(int(imu.stamp[i]), imu.gyr[i], imu.acc[i])
             estimator.finish()
+    _orientation_messages(imu, mag)
+
+
+def _orientation_messages(imu, mag) -> None:
+    """What turns rows into messages."""
+    from imu_fusion.messages.convert import imu_message, mag_message
+    from imu_fusion.streams.orientation import (
+        OrientationOutputParams,
+        OrientationParams,
+        OrientationStream,
+    )
+
+    stream = OrientationStream(OrientationParams(),
+                               OrientationOutputParams(remove_gravity_vector=True))
+    stream.take({
+        "imu/data_raw": [imu_message(int(s), "imu_link", g, a)
+                         for s, g, a in zip(imu.stamp, imu.gyr, imu.acc)],
+        "imu/mag": [mag_message(int(s), "imu_link", m) for s, m in zip(mag.stamp, mag.mag)]})
+    stream.finish()
 
 
 def _smoother() -> None:

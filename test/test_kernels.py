@@ -155,7 +155,8 @@ def test_numba_cache_dir_is_respected(copy, tmp_path):
 
 
 def test_processes_at_once_leave_whole_files_only(copy):
-    assert [result(p) for p in [start(copy) for _ in range(4)]] == [(True, 10.0)] * 4
+    found = [result(p) for p in [start(copy) for _ in range(4)]]    # who is late finds it compiled
+    assert [value for _, value in found] == [10.0] * 4 and any(compiled for compiled, _ in found)
     files = [f for f in (copy / "__pycache__" / "kernels").rglob("*") if f.is_file()]
     assert files and all(f.suffix == ".nbc" for f in files)
     assert compute(copy) == (False, 10.0)

@@ -34,7 +34,7 @@ ARROWS = {
                 "messages"),
     "compile_ahead": ("errors", "kernels", "geometry", "samples", "surfaces",
                       "estimation.orientation", "estimation.acceleration_field",
-                      "estimation.smoother", "streams"),
+                      "estimation.smoother", "messages", "streams"),
     "simulation": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
                    "estimation.acceleration_field"),
     "nodes": ("errors", "kernels", "parameters", "samples", "surfaces", "estimation.orientation",

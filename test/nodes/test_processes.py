@@ -74,7 +74,8 @@ def test_signal_closes_the_recording_with_all_that_was_taken(graph, tmp_path, nu
 
 def test_signal_to_the_replayer_ends_its_session(graph, bag):
     sink = collector(graph)
-    replayer = start("replayer", bag=bag, rate="0.01")
+    # Named, so that it is waited for: else a signal may come before the replayer has seen it.
+    replayer = start("replayer", bag=bag, rate="0.01", wait_for_nodes="[collector]")
     graph.until(lambda: sink.messages["/imu/data_raw"])
     replayer.send_signal(signal.SIGINT)
     graph.until(lambda: sink.ended == [END])
