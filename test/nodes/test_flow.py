@@ -197,6 +197,20 @@ def test_short_sessions_one_after_the_other_with_new_receivers_lose_nothing(grap
     assert not doubler.flow.problems
 
 
+def test_a_promise_of_another_session_lasts_until_that_begins(graph):
+    """The sender says other things in between, and never that the last session goes on."""
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    sender.session(10, event=NEXT)
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    sender.flow._say()
+    peer = receiver.flow.peers[sender.source._own]
+    graph.until(lambda: not peer.state.sending.session)
+    assert receiver.flow.sink.promised()
+    sender.session(10)
+    graph.until(lambda: receiver.ended == [NEXT, END])
+    assert not receiver.flow.sink.promised()
+
+
 def test_late_joiner_gets_everything_from_where_it_joined(graph):
     early = Receiver(graph, "early")
     sender = Sender(graph, wait_for=["early"])

@@ -136,7 +136,7 @@ class Source:
 
     def sending(self) -> Sending:
         """What is said of the session."""
-        if not self._session:
+        if self.phase == _LIVE:
             return Sending()
         return Sending(
             self._session, self._event if self.phase == _ENDED else BEGIN,
