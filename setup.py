@@ -19,7 +19,8 @@ terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
 docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
-test = ["ruff>=0.6", "mypy>=1.10", "types-PyYAML", "pytest>=7.4", "pytest-xdist>=3.5",
+test = ["ruff~=0.17.6", "mypy~=2.4.1", "types-PyYAML",
+        "pytest>=7.4", "pytest-xdist>=3.5",
         "hypothesis>=6", "colcon-common-extensions", *report, *terrain, *docs]
 
 # Read, not imported: nothing of the package is installed yet.

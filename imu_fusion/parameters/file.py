@@ -13,8 +13,11 @@ from imu_fusion.parameters.declare import Parameters, flatten, unknown_parameter
 class _Loader(yaml.SafeLoader):
     """Also reads lists as launch_ros writes them into the files that it makes: as tuples."""
 
+    def construct_tuple(self, node: yaml.SequenceNode) -> list[Any]:
+        return self.construct_sequence(node)
 
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", yaml.SafeLoader.construct_sequence)
+
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_tuple)
 
 
 def dump(node: str, values: dict[str, Any]) -> str:

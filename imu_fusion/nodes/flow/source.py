@@ -304,7 +304,8 @@ class Source:
         """Find out who subscribes and is not, or not yet, known as one of ours."""
         ours = {peer.name for peer in self._peers.values() if peer.state}
         ours.add(self.node.get_fully_qualified_name())
-        self.foreign, since = {}, {}
+        since: dict = {}
+        self.foreign = {}
         for topic in self.outputs:
             others = [info for info in self.node.get_subscriptions_info_by_topic(topic)
                       if full_name(info) not in ours]
