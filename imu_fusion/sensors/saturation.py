@@ -1,17 +1,140 @@
-"""Gyroscope axes at their limit, replaced from the magnetometer: Winkler 2025, appendix B.
+"""Axes at the end of their range: where that is, and rates that were lost there.
 
-Sample by sample and as the paper has it: fit for single missing samples of a slow
-gyroscope beside a quiet magnetometer. Whole bursts are better solved at once, by the
-orientation estimator's own saturation states (method ``fusion``).
+**Flat tops** tell the range where nobody has given it. Four equal largest values in a row, run into
+with a step, are one. Behind a calibration matrix, a filter or a subtracted bias values at the limit
+are no longer equal: then it is a run within a narrow band that is longer than a smooth peak's with
+such steep edges. A parabola is within a band b for n samples and enters it by a step e with
+(n - 1) e <= 6 b, whatever its curvature; two runs of more at one level prove a limit.
+
+**Recovery** is Winkler 2025, appendix B: sample by sample and as the paper has it, fit for single
+missing samples of a slow gyroscope beside a quiet magnetometer. Whole bursts are better solved at
+once, by the orientation estimator's own saturation states (method ``fusion``).
 """
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_fusion.errors import SampleError
+from imu_fusion.kernels import njit
 
 # The two ends of a range differ by a step (-32768, +32767), of 14 bits at the coarsest.
 LIMIT_TOLERANCE = 1.5e-4
+# Of the limit: what misalignment, scale and bias of a calibration leave of a flat top's flatness.
+BAND = 0.01
+_REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
+# A flat top is run into by a step of more than this share of its size. A smooth peak that repeats
+# four times was reached by about one step of quantisation: 5e-4 of full scale for 12 bits.
+_ENTRY_SHARE = 2e-3
+_RUN = 4                   # samples of the shortest run that counts: fewer have no shape
+_STEEP = 12.0              # (n - 1) e / b of a run that counts: twice that of a smooth peak
+
+FLAT_TOPS = np.dtype([
+    ("limit", "f8", 3),                  # given or found; inf: none
+    ("tolerance", "f8", 3),              # share of it by which values at it may fall short
+    ("last", "f8", 3),                   # value of the sample before
+    ("largest", "f8", 3),                # of what lasted two samples
+    ("repeats", "i8", 3),                # of the present value
+    ("value_step", "f8", 3),             # with which the present value was reached
+    ("count", "i8", 3),                  # samples of the present run
+    ("low", "f8", 3),                    # of it
+    ("high", "f8", 3),
+    ("run_step", "f8", 3),               # with which it was reached
+    ("counted", "i8", 3),                # 1 if it is a flat top already
+    ("level", "f8", 3),                  # of the last flat top; 0: none yet
+], align=True)
+"""What the search for the limits of three axes remembers."""
+
+
+@njit
+def start_flat_tops(found, ranges):
+    """Begin a search: limits that were given, (3,); those to be found (nan) are infinite."""
+    for i in range(3):
+        given = not math.isnan(ranges[i])
+        found.limit[i] = ranges[i] if given else math.inf
+        # A range from a data sheet is that before calibration.
+        found.tolerance[i] = BAND if given else LIMIT_TOLERANCE
+
+
+@njit
+def find_flat_tops(found, ranges, floor, sample):
+    """Learn each axis' limit, unless given; mark the axes at theirs.
+
+    Args:
+        found: FLAT_TOPS, what was learnt so far; changed.
+        ranges: (3,), nan for an axis whose limit is to be found.
+        floor: no sensor has a smaller range; what is within a band needs twice that. The unit is
+            the sample's.
+        sample: (3,), in order.
+
+    Returns:
+        int, bits of the axes at their limit, x first.
+    """
+    clipped = 0
+    # A driver that repeats whole samples makes no flat tops.
+    held = (sample[0] == found.last[0] and sample[1] == found.last[1]
+            and sample[2] == found.last[2])
+    for i in range(3):
+        size = abs(sample[i])
+        if math.isnan(ranges[i]) and not held:
+            _look_at(found, i, sample[i], floor)
+        if size >= found.limit[i] * (1.0 - found.tolerance[i]):
+            clipped |= 1 << i
+        found.last[i] = sample[i]
+    return clipped
+
+
+@njit
+def _look_at(found, i, value, floor):
+    """One value of axis i, whose limit is to be found."""
+    size, move = abs(value), abs(value - found.last[i])
+    if move == 0.0:
+        found.repeats[i] += 1
+        if (found.repeats[i] >= _REPEATS_AT_LIMIT - 1
+                and size >= found.largest[i] * (1.0 - LIMIT_TOLERANCE)
+                and found.value_step[i] > _ENTRY_SHARE * size > _ENTRY_SHARE * floor):
+            # Values that are equal say more than values within a band.
+            known = found.limit[i] if found.tolerance[i] == LIMIT_TOLERANCE else math.inf
+            found.limit[i] = min(known, size)
+            found.tolerance[i] = LIMIT_TOLERANCE
+    else:
+        found.repeats[i] = 0
+        found.value_step[i] = move
+    # Two samples in a row: a single wild one neither hides nor disproves a limit.
+    lasting = min(size, abs(found.last[i]))
+    found.largest[i] = max(found.largest[i], lasting)
+    if lasting > found.limit[i] * (1.0 + found.tolerance[i]):
+        found.limit[i] = math.inf    # a value that lasted and was no limit
+    if lasting > found.level[i] * (1.0 + BAND):
+        found.level[i] = 0.0
+    high, low = max(found.high[i], size), min(found.low[i], size)
+    if value * found.last[i] > 0.0 and high - low <= BAND * high:
+        found.high[i], found.low[i] = high, low
+        found.count[i] += 1
+        _judge_run(found, i, found.run_step[i], floor)
+    else:
+        _judge_run(found, i, move, floor)
+        found.count[i], found.counted[i] = 1, 0
+        found.high[i] = found.low[i] = size
+        found.run_step[i] = move
+
+
+@njit
+def _judge_run(found, i, edge, floor):
+    """Whether the present run of axis i, with a step ``edge`` at an end, is a flat top; the second
+    at one level proves the limit."""
+    level = 0.5 * (found.low[i] + found.high[i])
+    if (found.counted[i] or found.count[i] < _RUN or level < 2.0 * floor
+            or found.high[i] < found.largest[i] * (1.0 - BAND)
+            or (found.count[i] - 1) * edge < _STEEP * BAND * level):
+        return
+    found.counted[i] = 1
+    if found.level[i] > 0.0 and abs(level - found.level[i]) < BAND * level < math.inf:
+        if found.limit[i] == math.inf:
+            found.limit[i] = max(level, found.level[i])
+            found.tolerance[i] = BAND
+    found.level[i] = level
 
 
 def saturated_axes(gyr: np.ndarray, limit: ArrayLike) -> np.ndarray:

@@ -43,7 +43,7 @@ def carry(s, p):
             s.angular_acc[i] = slope
             s.clipped_rate[i] = (slope - entered) * dt
             # As old as the slope is, or as the limit where it was only now found.
-            age = (1.0 + s.gyro_limit.repeats[i]) * dt if dt > 0.0 else p.gap.max
+            age = max(s.gyro_limit.count[i], 1) * dt if dt > 0.0 else p.gap.max
             noises[es.ANGULAR_ACC + i], noises[es.CLIPPED_RATE + i] = noise(p, age)
         elif (s.clipped >> i) & 1:
             s.clipped_rate[i] += s.angular_acc[i] * gain(p, dt)

@@ -274,6 +274,9 @@ def update(cov, error, states, row, tape):
         row: a ROW.
         tape: (1,) TAPE of the block, or empty.
 
+    Returns:
+        The measurement's log likelihood, less a constant.
+
     Raises:
         IndexError: the tape is full: MAX_UPDATES is less than the measurements of a block.
     """
@@ -298,6 +301,7 @@ def update(cov, error, states, row, tape):
         if gain != 0.0:
             for j in range(states):
                 cov[i, j] -= gain * spread[j]
+    return -0.5 * (math.log(total) + innovation * innovation / total)
 
 
 @njit

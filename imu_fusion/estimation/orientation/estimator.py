@@ -317,11 +317,17 @@ class OrientationEstimator:
         first_mag = mag_stamps <= end
         first_mag[first_mag] = [is_mag_sample(mag) for mag in mags[first_mag]]
         self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
+        self._know_limits(limits_of(samples[good, :3], self._par))
         rows = np.zeros(len(imu), ORIENTATION_DTYPE)
         after = mag_stamps >= origin
         written = smooth(self._state, self._par, imu.stamp, samples, mag_stamps[after],
                          mags[after], rows)
         return rows[:written]
+
+    def _know_limits(self, found):
+        """What the whole recording shows of the gyroscope's limits holds from its first sample."""
+        for name in ("limit", "tolerance"):
+            self._state["gyro_limit"][name] = found[name]
 
     def _start(self):
         """Align on the waiting samples and send them through the kernel."""
@@ -343,7 +349,7 @@ class OrientationEstimator:
         mag_stamps, mag = mag_stamps[usable], mag[usable]
         calibrated = (mag - sensor.mag_offset) @ np.reshape(sensor.mag_matrix, (3, 3)).T
         self._alignment = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
-                                self.params, limits_of(samples[:, :3], par))
+                                self.params, limits_of(samples[:, :3], par)["limit"][0])
         if not self._alignment.has_heading and self._yaw:
             turn = self._yaw - quat_to_rpy(self._alignment.quat_world_imu)[2]
             self._alignment = replace(self._alignment, quat_world_imu=np.array(

@@ -324,12 +324,12 @@ def correct(s, p, error, tape):
     for i in range(3):
         if s.step.still:
             rest.gyro_bias(i, s, p, rows[0])
-            es.update(s.cov, error, states, rows[0], tape)
+            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)
         if p.use_acc:    # without force, velocity and position tell nothing
             bounded_motion.velocity(i, s, p, scale, rows[0])
-            es.update(s.cov, error, states, rows[0], tape)
+            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)
             bounded_motion.position(i, s, p, scale, rows[0])
-            es.update(s.cov, error, states, rows[0], tape)
+            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)
     if s.mag_sum.count > 0:
         magnetometer.field(s, p, error, rows)
         for i in range(3):

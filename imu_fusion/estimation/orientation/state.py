@@ -9,6 +9,7 @@ records of their own. Rates are rad/s in imu axes, specific forces m/s^2, stamps
 import numpy as np
 
 from imu_fusion.estimation.orientation.error_state import PREDICTION, ROW, N
+from imu_fusion.sensors.saturation import FLAT_TOPS
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
 QUEUE_LENGTH = 128    # samples that wait: at 1 kHz more than the largest delay, 0.1 s
@@ -38,15 +39,6 @@ MAG_LIMIT = np.dtype([
     ("repeats", "i8", 3),                # of the present value
 ], align=True)
 """The search for the magnetometer's range (mag_rejection)."""
-
-GYRO_LIMIT = np.dtype([
-    ("limit", "f8", 3),                  # given or found; inf: none
-    ("last", "f8", 3),                   # raw
-    ("entry_step", "f8", 3),             # with which it was reached
-    ("largest", "f8", 3),
-    ("repeats", "i8", 3),                # of the present value
-], align=True)
-"""The search for the gyroscope's range (gyro_limit)."""
 
 GYRO_SPIKE = np.dtype([
     ("usual_change", "f8"),              # from sample to sample
@@ -135,7 +127,7 @@ STATE = np.dtype([
     ("history", ROTATION_HISTORY),
     ("queue", MAG_QUEUE),
     ("mag_limit", MAG_LIMIT),
-    ("gyro_limit", GYRO_LIMIT),
+    ("gyro_limit", FLAT_TOPS),           # the search for the gyroscope's range
     ("spike", GYRO_SPIKE),
     ("rest", REST),
     ("motion", MOTION),
@@ -159,6 +151,7 @@ STATE = np.dtype([
     ("cov", "f8", (N, N)),               # of the error state, at the end of the last block
     ("field_norm", "f8"),                # T; 0 before the first sample
     ("gravity", "f8"),                   # m/s^2
+    ("log_likelihood", "f8"),            # of all measurements so far, less a constant
     ("heading_var", "f8"),               # rad^2, of a heading that no filter can improve on
     # The block being collected.
     ("block", PREDICTION),

@@ -75,12 +75,11 @@ def _share_errors(s, p, b, has_heading, follow):
                 row.coefficient[_MATRIX + 3 * c + d] = r[i, c] * m[d] * follow
         es.update(s.cov, error, es.N, row, no_tape)
     if has_heading and follow:
-        # The needle points to azimuth D: nothing across it.
-        row.count = 4
-        for c in range(2):
-            row.index[c], row.index[2 + c] = es.FIELD + c, es.LOCAL_FIELD + c
-        row.coefficient[0] = row.coefficient[2] = math.cos(p.declination)
-        row.coefficient[1] = row.coefficient[3] = -math.sin(p.declination)
+        # North is where the field of the surroundings points, to azimuth D: nothing across it.
+        # What the place of the first sample adds turns the needle that it shows.
+        row.count = 2
+        row.index[0], row.index[1] = es.FIELD, es.FIELD + 1
+        row.coefficient[0], row.coefficient[1] = math.cos(p.declination), -math.sin(p.declination)
         es.update(s.cov, error, es.N, row, no_tape)
 
 
@@ -187,7 +186,6 @@ def field(s, p, error, rows):
     sd = p.fusion.mag_disturbance_sd + p.fusion.norm_deviation_factor * deviation
     variance = (sd * sd * max(_WHITE_TIME / s.block.time, 1.0 / count)
                 + (p.sensor.mag_noise_sd / s.field_norm) ** 2 / count)
-    distance = 0.0
     for i in range(3):
         row = rows[i]
         _put_columns(row, i, expected)
@@ -197,18 +195,47 @@ def field(s, p, error, rows):
             row.coefficient[_OFFSET + c] = total.offset[i, c] / count
         for c in range(9):
             row.coefficient[_MATRIX + c] = total.matrix[i, c] / count
-        distance += _distance(s.cov, error, row, variance)
+    distance, log_det = _innovation(s.cov, error, rows, variance)
+    # Of the t distribution, less what is the same for all hypotheses.
+    s.log_likelihood -= 0.5 * (log_det + (_TAIL_DOF + 3.0) * math.log1p(distance / _TAIL_DOF))
     variance *= (_TAIL_DOF + distance) / (_TAIL_DOF + 3.0)
     for i in range(3):
         rows[i].variance = variance
 
 
 @njit
-def _distance(cov, error, row, variance):
-    """Squared innovation of one row over its variance."""
-    residual = row.residual
-    for a in range(_COLUMNS):
-        residual -= row.coefficient[a] * error[row.index[a]]
-        for b in range(_COLUMNS):
-            variance += row.coefficient[a] * row.coefficient[b] * cov[row.index[a], row.index[b]]
-    return residual * residual / variance
+def _innovation(cov, error, rows, variance):
+    """Squared Mahalanobis distance of the innovation of rows (3,), and its covariance's log
+    determinant; ``variance``: of each row's noise. error (N,): the error state so far."""
+    total = np.empty((3, 3))
+    residual = np.empty(3)
+    for i in range(3):
+        row = rows[i]
+        residual[i] = row.residual
+        for a in range(_COLUMNS):
+            residual[i] -= row.coefficient[a] * error[row.index[a]]
+        for j in range(i + 1):
+            other = rows[j]
+            total[i, j] = variance if i == j else 0.0
+            for b in range(_COLUMNS):
+                if other.coefficient[b] != 0.0:
+                    line = cov[other.index[b]]
+                    part = 0.0
+                    for a in range(_COLUMNS):
+                        part += row.coefficient[a] * line[row.index[a]]
+                    total[i, j] += other.coefficient[b] * part
+    distance = 0.0
+    log_det = 0.0
+    # Cholesky's factor in place, and the residual through it.
+    for i in range(3):
+        for j in range(i + 1):
+            part = total[i, j]
+            for k in range(j):
+                part -= total[i, k] * total[j, k]
+            total[i, j] = math.sqrt(part) if i == j else part / total[j, j]
+        for k in range(i):
+            residual[i] -= total[i, k] * residual[k]
+        residual[i] /= total[i, i]
+        distance += residual[i] ** 2
+        log_det += 2.0 * math.log(total[i, i])
+    return distance, log_det

@@ -1,0 +1,275 @@
+"""Orientation on every set at hand beside VQF and OfflineVQF, in one run.
+
+    python -m benchmarks.orientation_sets [--quick] [--trials] [SET ...]
+
+``--quick`` takes two recordings of each set, ``--trials`` prints every recording. Parameters are
+the defaults everywhere, also the peers'.
+
+**Time.** An estimate at stamp t is the attitude at t, and a rate is the rate at its stamp:
+between stamps it changes linearly. VQF applies the rate of a stamp to the whole step that ends
+there, so that its estimates are those of half a step later; they are moved back by that, along the
+rotation between two of them.
+
+**Frames.** Where a reference has frames of its own, one turn of its world and one of its body are
+fitted per recording and estimator, over all rows (``fit_frames``).
+"""
+
+import sys
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from vqf import VQF, offlineVQF
+
+from benchmarks.data import broad_trials, data_path, load_broad
+from benchmarks.table import write_table
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+from imu_fusion.evaluation.orientation_error import split_angles
+from imu_fusion.samples.logs import ImuLog, MagLog
+
+# chi2 with 3 degrees of freedom, the probability of 3 sigma of a normal variate.
+_THREE_SIGMA = 14.156
+WORSE = 1.25
+_CUT = 1500              # samples after motion begins
+_TURN_ROWS = 20          # over which turns show how a body is mounted
+_FIT_ROUNDS = 100
+_FAST = ("06", "08", "21", "28")
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Samples and reference, (n, 4) xyzw, nan where unknown; mask (n,) of the rows that count.
+
+    frames: what is fitted before an error is taken: "" nothing, "yaw" the reference's heading,
+    "level" that and its body, "full" its world and its body.
+    """
+
+    name: str
+    imu: ImuLog
+    mag: MagLog | None
+    reference: np.ndarray
+    mask: np.ndarray
+    frames: str = ""
+
+
+@dataclass(frozen=True)
+class Score:
+    """RMSE in degrees; where a covariance is stated: share of rows within 3 sigma, and the median
+    of stated over actual standard deviation of inclination and heading."""
+
+    total: float
+    inclination: float
+    heading: float
+    within: float = np.nan
+    tilt_ratio: float = np.nan
+    heading_ratio: float = np.nan
+
+
+def _broad():
+    for path in broad_trials():
+        yield Recording(f"broad {path.name[:2]}", *load_broad(path))
+
+
+def _in_motion():
+    for r in _broad():
+        first = int(np.argmax(r.mask)) + _CUT
+        yield replace(r, name=r.name + " cut", imu=r.imu[first:], mag=r.mag[first:],
+                      reference=r.reference[first:], mask=r.mask[first:])
+
+
+def _clipped():
+    """Fast trials clipped at 500 deg/s behind a calibration: flat tops that are not equal."""
+    for k, r in enumerate(r for r in _broad() if r.name[-2:] in _FAST):
+        rng = np.random.default_rng(k)
+        matrix = np.eye(3) + rng.normal(0, 0.003, (3, 3))
+        limit = np.radians(500)
+        raw = np.clip(r.imu.gyr @ np.linalg.inv(matrix).T, -limit, limit)
+        gyr = raw @ matrix.T + rng.normal(0, 2e-3, raw.shape)
+        yield replace(r, name=r.name + " clipped", imu=ImuLog(r.imu.stamp, gyr, r.imu.acc))
+
+
+def _poor_gyroscope():
+    """Moderate trials without magnetometer, the scale of each axis off by 4 to 8 %."""
+    for k, r in enumerate(r for r in _broad() if r.name[-2:] not in _FAST + ("01",)):
+        rng = np.random.default_rng(k)
+        gyr = r.imu.gyr * (1.0 + rng.uniform(0.04, 0.08, 3) * rng.choice([-1.0, 1.0], 3))
+        yield replace(r, name=r.name + " poor", imu=ImuLog(r.imu.stamp, gyr, r.imu.acc), mag=None,
+                      frames="yaw")
+
+
+def _npz(folder, pattern="*.npz"):
+    """Files of benchmarks/data: rows gyr, acc, quat, mov, and a magnetometer in step or not."""
+    for path in sorted(data_path(folder).glob(pattern)):
+        d = np.load(path)
+        t = d["t"] if "t" in d else np.arange(len(d["gyr"])) / float(d["fs"])
+        stamp = np.round(t * 1e9).astype(np.int64)
+        mag = None
+        if "mag" in d:
+            mag = MagLog(stamp, d["mag"] * 1e-6)
+        elif "mag_n" in d:
+            mag = MagLog(np.round(d["mag_t"] * 1e9).astype(np.int64), d["mag_n"] * 1e-6)
+        frames = "yaw" if d["align"] == "yaw" else "level" if d["vertical"] else "full"
+        yield Recording(f"{folder} {path.stem}", ImuLog(stamp, d["gyr"], d["acc"]), mag,
+                        d["quat"].astype(float)[:, [1, 2, 3, 0]], d["mov"].astype(bool), frames)
+
+
+SETS = {
+    "BROAD": _broad,
+    "BROAD, start in motion": _in_motion,
+    "BROAD, clipped behind a calibration": _clipped,
+    "BROAD, poor gyroscope, no magnetometer": _poor_gyroscope,
+    "DIODEM": lambda: _npz("diodem"),
+    "phones, no magnets": lambda: _npz("phone", "*_NoDist_*.npz"),
+    "phones, magnets": lambda: _npz("phone", "*_Dist_*.npz"),
+    "OpenAXES, no magnetometer": lambda: _npz("openaxes"),
+}
+"""Name of the set to a function of its Recordings; nothing where the data is not at hand."""
+
+
+def _nearest(m):
+    """Rotation matrix next to a sum of them, (3, 3)."""
+    u, _, v = np.linalg.svd(m)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+
+
+def _nearest_yaw(m):
+    """Turn about z next to a sum of rotation matrices, (3, 3)."""
+    return Rotation.from_euler("z", np.arctan2(m[1, 0] - m[0, 1], m[0, 0] + m[1, 1])).as_matrix()
+
+
+def _body_start(est, ref, step):
+    """Body of the reference in the estimate's axes from turns over ``step`` rows (Wahba)."""
+    turned = [Rotation.from_matrix(m[:-step].transpose(0, 2, 1) @ m[step:]).as_rotvec()
+              for m in (ref, est)]
+    return _nearest(turned[0].T @ turned[1])
+
+
+def fit_frames(estimate, r):
+    """r.reference (n, 4) in the frames of the estimate (n, 4), nan where unknown."""
+    if not r.frames:
+        return r.reference
+    known = np.isfinite(r.reference).all(axis=1)
+    est = Rotation.from_quat(estimate[known]).as_matrix()
+    ref = Rotation.from_quat(r.reference[known]).as_matrix()
+    nearest = _nearest if r.frames == "full" else _nearest_yaw
+    products = np.einsum("nai,nbk->aibk", est, ref)
+    body = np.eye(3) if r.frames == "yaw" else _body_start(est, ref, _TURN_ROWS)
+    for _ in range(_FIT_ROUNDS):
+        world = nearest(np.einsum("aibk,ki->ab", products, body))
+        if r.frames != "yaw":
+            body = _nearest(np.einsum("aibk,ab->ki", products, world))
+    out = np.full(r.reference.shape, np.nan)
+    out[known] = Rotation.from_matrix(world @ ref @ body).as_quat()
+    return out
+
+
+def score(r, quat, cov=None):
+    """Score of estimates (n, 4) at the recording's rows; cov (n, 3, 3) of the local error."""
+    reference = fit_frames(quat, r)
+    keep = r.mask & np.isfinite(reference).all(axis=1)
+    estimate = Rotation.from_quat(quat[keep])
+    error = estimate * Rotation.from_quat(reference[keep]).inv()
+    angles = np.degrees(split_angles(error.as_quat()))
+    total, heading, inclination = np.sqrt((angles ** 2).mean(axis=1))
+    if cov is None:
+        return Score(total, inclination, heading)
+    turn = estimate.as_matrix()
+    world = turn @ cov[keep] @ turn.transpose(0, 2, 1)
+    vector = error.as_rotvec()
+    distance = (vector * np.linalg.solve(world, vector[..., None])[..., 0]).sum(axis=1)
+    tilt = np.degrees(np.sqrt((world[:, 0, 0] + world[:, 1, 1]).mean()))
+    yaw = np.degrees(np.sqrt(world[:, 2, 2].mean()))
+    return Score(total, inclination, heading, float((distance < _THREE_SIGMA).mean()),
+                 tilt / inclination, np.nan if r.mag is None else yaw / heading)
+
+
+def _half_a_step_back(quat):
+    """Estimates (n, 4) that are ahead by half a step, at their stamps."""
+    turn = Rotation.from_quat(quat)
+    between = (turn[1:].inv() * turn[:-1]).as_rotvec()
+    return np.vstack([quat[:1], (turn[1:] * Rotation.from_rotvec(0.5 * between)).as_quat()])
+
+
+def _peer(r, offline):
+    """VQF's estimates, magnetometer interpolated at the rows of the Imu."""
+    dt = float((r.imu.stamp[-1] - r.imu.stamp[0]) * 1e-9 / (len(r.imu) - 1))
+    field = None
+    if r.mag is not None:
+        field = 1e6 * np.column_stack([np.interp(r.imu.stamp, r.mag.stamp, m)
+                                       for m in r.mag.mag.T])
+    gyr, acc = (np.ascontiguousarray(v, dtype=float) for v in (r.imu.gyr, r.imu.acc))
+    out = offlineVQF(gyr, acc, field, dt) if offline else VQF(dt).updateBatch(gyr, acc, field)
+    return _half_a_step_back(out["quat6D" if field is None else "quat9D"][:, [1, 2, 3, 0]])
+
+
+def ours(r, mode, changes=None):
+    """(n, 4), (n, 3, 3) of our estimator at the recording's rows."""
+    estimator = OrientationEstimator(OrientationParams.from_mapping({"mode": mode,
+                                                                     **(changes or {})}))
+    rows = np.concatenate([estimator.run(r.imu, r.mag), estimator.finish()])
+    if len(rows) != len(r.imu):
+        raise ValueError(f"{r.name}: {len(rows)} rows of {len(r.imu)} samples")
+    return rows["quat_world_imu"], rows["cov_attitude"]
+
+
+def score_all(r, changes=None):
+    """Scores of one recording by estimator's name."""
+    return {"VQF": score(r, _peer(r, False)), "OfflineVQF": score(r, _peer(r, True)),
+            "causal": score(r, *ours(r, "causal", changes)),
+            "smoothed": score(r, *ours(r, "smoothed", changes))}
+
+
+def summary(name, scores):
+    """Cells of a set's two lines, causal and smoothed: scores a list of score_all's."""
+    for mode, peer in (("causal", "VQF"), ("smoothed", "OfflineVQF")):
+        mine, other = [s[mode] for s in scores], [s[peer] for s in scores]
+        means = [" / ".join(f"{np.mean([getattr(s, part) for s in group]):.2f}"
+                            for part in ("total", "inclination", "heading"))
+                 for group in (other, mine)]
+        worse = sum(m.total > WORSE * o.total for m, o in zip(mine, other))
+        yield [name, str(len(scores)), mode, *means,
+               f"{sum(m.total for m in mine) / sum(o.total for o in other):.2f}",
+               f"{np.mean([m.within for m in mine]):.2f}",
+               f"{np.median([m.tilt_ratio for m in mine]):.1f}",
+               f"{np.median([m.heading_ratio for m in mine]):.1f}", str(worse)]
+
+
+def trial_line(name, scores):
+    """One recording's totals, for the terminal."""
+    return f"  {name:45s}" + "  ".join(
+        f"{k} {s.total:6.2f} i{s.inclination:5.2f} h{s.heading:6.2f}"
+        + ("" if np.isnan(s.within) else
+           f" in{s.within:4.2f} x{s.tilt_ratio:4.1f},{s.heading_ratio:4.1f}")
+        for k, s in scores.items())
+
+
+HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "ours",
+          "ours / peer", "within 3 sigma", "stated / actual, inclination", "heading",
+          "trials > 25 % worse"]
+
+
+def main(arguments):
+    quick, trials = "--quick" in arguments, "--trials" in arguments
+    chosen = [a for a in arguments if not a.startswith("--")] or list(SETS)
+    rows = []
+    for name in chosen:
+        recordings = list(SETS[name]())[:2 if quick else None]
+        scores = []
+        for r in recordings:
+            scores.append(score_all(r))
+            if trials:
+                print(trial_line(r.name, scores[-1]), flush=True)
+        rows += summary(name, scores) if scores else []
+    if quick or chosen != list(SETS):
+        for row in rows:
+            print(" | ".join(row))
+        return
+    write_table("orientation_sets", HEADER, rows,
+                note=f"Peers: VQF (causal) and OfflineVQF (smoothed) of vqf {version('vqf')}, "
+                     "default parameters, as ours. RMSE over the rows that count, mean over the "
+                     "trials. Time and frames: see the benchmark's docstring.")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
