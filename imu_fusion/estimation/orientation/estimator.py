@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.orientation import kernel
+from imu_fusion.estimation.orientation import bank, kernel
 from imu_fusion.estimation.orientation.alignment import Alignment, align, usable_mags
 from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.fixed_interval import smooth
@@ -60,13 +60,14 @@ class OrientationEstimator:
         """
         if self._kind(params) != self._kind(self.params):
             raise ParameterError(
-                "parameters 'method', 'gyro_mag.as_printed' and 'mode' cannot change while "
-                "running: start another estimator")
+                "parameters 'method', 'gyro_mag.as_printed', 'mode' and the number of values of "
+                "'fusion.local_field_sd' cannot change while running: start another estimator")
         self.params, self._par = params, kernel_parameters(params)
 
     @staticmethod
     def _kind(params):
-        return params.method, params.is_as_printed, params.mode
+        return (params.method, params.is_as_printed, params.mode,
+                len(params.fusion.local_field_sd))
 
     def reset(self) -> None:
         """Forget all samples: the next ones start a new alignment."""
@@ -75,7 +76,7 @@ class OrientationEstimator:
         self._forget()
 
     def _forget(self):
-        self._adopt(new_state())
+        self._adopt(new_state(len(self._par)))
         self._waiting = []
         self._waiting_imus = 0
         self._alignment: Alignment | None = None
@@ -83,7 +84,7 @@ class OrientationEstimator:
 
     def _adopt(self, state):
         self._state = state
-        self._newest = state["stamp"]    # a view: (1,)
+        self._newest = state["stamp"]    # a view: (k,), all equal
 
     def add_imu(self, stamp: int, gyr: ArrayLike, acc: ArrayLike) -> np.ndarray:
         """Take one Imu sample.
@@ -208,7 +209,7 @@ class OrientationEstimator:
         anew, at the yaw of before if nothing tells another."""
         rows = self.finish()
         if self._alignment is not None:
-            self._yaw = quat_to_rpy(self._state["quat_world_imu"][0])[2]
+            self._yaw = quat_to_rpy(self._likeliest()["quat_world_imu"])[2]
         corrected = self.take_corrected()
         self._counted = self._counts()
         self._counted["gaps"] += 1
@@ -248,7 +249,7 @@ class OrientationEstimator:
 
     def summary(self) -> dict[str, Any]:
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
-        s, par, a = self._state[0], self._par[0], self._alignment
+        s, par, a = self._likeliest(), self._par[0], self._alignment
         counts = dict(
             method=self.params.method, aligned=a is not None,
             **{name: int(value) for name, value in zip(COUNT_NAMES, self._counts()[0])})
@@ -265,11 +266,15 @@ class OrientationEstimator:
             gyro_delay=float(par["gyro_delay"]),
             mag_delay=float(par["gyro_delay"] + s["mag_lag"]))
 
+    def _likeliest(self):
+        """State of the likeliest hypothesis."""
+        return self._state[bank.likeliest(bank.weights(self._state))]
+
     def _counts(self):
         """Counts of the present stretch and of those before it, (1,) COUNTS."""
         total = self._counted.copy()
         for name in COUNT_NAMES:
-            total[name] += self._state["counts"][name]
+            total[name] += self._state["counts"][name][0]
         return total
 
     def _step(self, stamp):

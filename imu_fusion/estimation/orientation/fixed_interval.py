@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from imu_fusion.estimation.orientation import bank
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation.kernel import CURSOR, forward
 from imu_fusion.estimation.orientation.rows import clipped_axes, raise_to_limits, write_cov_attitude
@@ -34,32 +35,59 @@ _BIAS, _CLIPPED = 3, 9    # in _REPORTED
 
 def smooth(state: np.ndarray, par: np.ndarray, stamps: np.ndarray, samples: np.ndarray,
            mag_stamps: np.ndarray, mags: np.ndarray, rows: np.ndarray) -> int:
-    """Smoothed rows of a whole recording.
+    """Smoothed rows of a whole recording: the mixture of what its hypotheses give, with the weights
+    that they have at its end.
 
     Args:
-        state, par: (1,), initialised; ends as the causal filter's.
+        state, par: (k,), initialised; ends as the causal filter's.
         stamps (n,), samples (n, 6), mag_stamps (m,), mags (m, 3): as for kernel.forward.
         rows: (n,) ORIENTATION_DTYPE, zeros.
 
     Returns:
         Number of rows written.
     """
+    logs = stamps, samples, mag_stamps, mags
     tapes = np.zeros(_SEGMENT, es.TAPE)
+    bank.part(state)
+    several = len(state) > 1 and (len(mags) > 0 or state["field_norm"][0] > 0.0)
+    own = [rows, *(np.zeros_like(rows) for _ in state[1:] if several)]
+    passes = [_forward(state[k:k + 1], par[k:k + 1], logs, own[k], tapes)
+              for k in range(len(own))]
+    weight = bank.weights(state)
+    for k in np.flatnonzero(weight):
+        _smooth(state[k:k + 1], par[k:k + 1], logs, own[k], tapes, passes[k])
+    written = int(passes[0][-1][1]["row"][0])
+    if several:
+        bank.mix_all(np.stack([part[:written] for part in own]), weight, rows)
+    return written
+
+
+_Pass = list[tuple[np.ndarray, np.ndarray]]    # state and cursor before each segment and at the end
+
+
+def _forward(state: np.ndarray, par: np.ndarray, logs: tuple[np.ndarray, ...], rows: np.ndarray,
+             tapes: np.ndarray) -> _Pass:
+    """The filter of one hypothesis over the recording."""
     cursor = np.zeros(1, CURSOR)
     snapshots = []
-    while cursor["imu"][0] < len(stamps):
+    while cursor["imu"][0] < len(logs[0]):
         snapshots.append((state.copy(), cursor.copy()))
-        forward(state, par, stamps, samples, mag_stamps, mags, cursor, rows, tapes)
-    written = end = int(cursor["row"][0])
+        forward(state, par, *logs, cursor, rows, tapes)
+    return [*snapshots, (state, cursor)]
+
+
+def _smooth(state: np.ndarray, par: np.ndarray, logs: tuple[np.ndarray, ...], rows: np.ndarray,
+            tapes: np.ndarray, passed: _Pass) -> None:
+    """Correct the rows of one hypothesis, segment by segment from the last on."""
+    *snapshots, (_, cursor) = passed
+    end = int(cursor["row"][0])
     adjoint = np.zeros(es.N)
     information = np.zeros((es.N, es.N))
     for before, cursor in reversed(snapshots):
         first = int(cursor["row"][0])
-        blocks = forward(before.copy(), par, stamps, samples, mag_stamps, mags, cursor, rows,
-                         tapes)
+        blocks = forward(before.copy(), par, *logs, cursor, rows, tapes)
         _backward(tapes[:blocks], before, state, par, rows[first:end], first, adjoint, information)
         end = first
-    return written
 
 
 @njit

@@ -304,7 +304,7 @@ def _finish_prediction(s, p):
         noise[es.GYRO_BIAS + i] = p.sensor.gyro_bias_walk ** 2 * time
         noise[es.VELOCITY + i] = f.velocity_walk ** 2 * time
         noise[es.FIELD + i] = f.field_walk ** 2 * time
-        noise[es.LOCAL_FIELD + i] = f.local_field_sd ** 2 * (1.0 - keep * keep)
+        noise[es.LOCAL_FIELD + i] = p.local_field_sd ** 2 * (1.0 - keep * keep)
         if lasting:
             noise[es.ANGULAR_ACC + i] = acc_var
             noise[es.CLIPPED_RATE + i] = rate_var

@@ -1,7 +1,7 @@
 """The compiled core that live and batch share: samples in, rows out, one loop for both methods.
 
-Every function takes the state (1,) of :data:`state.STATE`, changed in place, and the parameters
-(1,) of :func:`params.kernel_parameters`.
+Every function takes the state (k,) of :data:`state.STATE`, changed in place, and the parameters
+(k,) of :func:`params.kernel_parameters`: an element for each hypothesis.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from imu_fusion.estimation.orientation import fusion, gyro_limit, gyro_mag, mag_queue
+from imu_fusion.estimation.orientation import bank, fusion, gyro_limit, gyro_mag, mag_queue
 from imu_fusion.estimation.orientation.alignment import Alignment
 from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
@@ -29,18 +29,21 @@ def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None
     if par["as_printed"][0]:
         gyro_mag.initialise(state, alignment)
     else:
-        fusion.initialise(state, par, alignment)
+        for k in range(len(state)):
+            fusion.initialise(state[k:k + 1], par[k:k + 1], alignment)
 
 
 @njit
 def _start_limits(state, par):
-    gyro_limit.start(state[0].gyro_limit, par[0].sensor.gyro_range)
+    for k in range(len(state)):
+        gyro_limit.start(state[k].gyro_limit, par[k].sensor.gyro_range)
 
 
 @njit
 def push_mag(state, par, stamp, mag):
     """Take one magnetometer sample: int64 ns, (3,) tesla as the sensor reports it."""
-    mag_queue.push(state[0], par[0], stamp, mag)
+    for k in range(len(state)):
+        mag_queue.push(state[k], par[k], stamp, mag)
 
 
 @njit
@@ -51,13 +54,14 @@ def step_imu(state, par, stamp, sample, rows):
     """
     if par[0].as_printed:
         return gyro_mag.step(state[0], par[0], stamp, sample, rows[0])
-    return fusion.step(state[0], par[0], stamp, sample, rows[0], np.empty(0, TAPE))
+    return bank.step(state, par, stamp, sample, rows[0])
 
 
 @cache
 def live_calls() -> tuple[Callable, Callable]:
     """:func:`step_imu` and :func:`push_mag` as live streams call them, a sample at a time."""
-    state, par = new_state(), kernel_parameters(OrientationParams())
+    par = kernel_parameters(OrientationParams())
+    state = new_state(len(par))
     return (entry_point(step_imu, state, par, 0, np.zeros(6), np.zeros(1, ORIENTATION_DTYPE)),
             entry_point(push_mag, state, par, 0, np.zeros(3)))
 
@@ -71,22 +75,25 @@ def forward(state, par, stamps, samples, mag_stamps, mags, cursor, rows, tapes):
         cursor: (1,) CURSOR, where to begin; gets where it ended.
         rows: (n,) ORIENTATION_DTYPE, written from ``cursor.row`` on.
         tapes: (k,) error_state.TAPE, one per block, for the smoother: the filter stops when all
-            are full. Empty: nothing is recorded, and it goes on to the end.
+            are full; of the first hypothesis alone. Empty: nothing is recorded, and it goes on to
+            the end.
 
     Returns:
         Blocks on tape.
     """
-    s, p, at = state[0], par[0], cursor[0]
+    at = cursor[0]
     blocks = 0
     while at.imu < len(stamps) and (blocks < len(tapes) or len(tapes) == 0):
         while at.mag < len(mag_stamps) and mag_stamps[at.mag] <= stamps[at.imu]:
-            mag_queue.push(s, p, mag_stamps[at.mag], mags[at.mag])
+            push_mag(state, par, mag_stamps[at.mag], mags[at.mag])
             at.mag += 1
         tape = tapes[blocks:blocks + 1]
-        if p.as_printed:
-            result = gyro_mag.step(s, p, stamps[at.imu], samples[at.imu], rows[at.row])
+        if len(tape) > 0:
+            result = fusion.step(state[0], par[0], stamps[at.imu], samples[at.imu], rows[at.row],
+                                 tape)
         else:
-            result = fusion.step(s, p, stamps[at.imu], samples[at.imu], rows[at.row], tape)
+            result = step_imu(state, par, stamps[at.imu], samples[at.imu],
+                              rows[at.row:at.row + 1])
         if result > 0:
             at.row += 1
         if result == 2 and len(tape) > 0:
@@ -96,6 +103,6 @@ def forward(state, par, stamps, samples, mag_stamps, mags, cursor, rows, tapes):
         at.imu += 1
     if at.imu == len(stamps):
         while at.mag < len(mag_stamps):
-            mag_queue.push(s, p, mag_stamps[at.mag], mags[at.mag])
+            push_mag(state, par, mag_stamps[at.mag], mags[at.mag])
             at.mag += 1
     return blocks

@@ -134,10 +134,11 @@ class FusionParams(Parameters):
         doc="Extent of the motion, per axis, about its mean. A hand's; 100 for a vehicle.")
     position_time: float = param(
         0.3, unit="s", low=1e-3, doc="Its correlation time. A hand's; 10 for a vehicle.")
-    local_field_sd: float = param(
-        0.01, low=0, high=1,
+    local_field_sd: tuple[float, ...] = param(
+        (0.01, 0.1), low=0, high=1, length=(1, 2),
         doc="What distinguishes the field of a place from its surroundings, relative to its norm. "
-            "Raise it indoors.")
+            "Two values are two hypotheses that the samples decide between; gyro_mag takes the "
+            "first. Raise the second near iron.")
     local_field_time: float = param(
         0.3, unit="s", low=1e-3,
         doc="Time in which a moving sensor leaves that behind. Lengthen it for slow motion.")
@@ -291,17 +292,24 @@ class OrientationParams(Parameters):
 
 
 def kernel_parameters(params: OrientationParams) -> np.ndarray:
-    """Parameters as the kernels read them: a one-element structured array.
+    """Parameters as the kernels read them: a structured array, an element for each hypothesis.
 
     Beside the parameters under their names it has, at the top level, what follows from them:
-    gyro_delay, gyro_delay_sd, mag_delay_sd (s; zero where a delay is taken as known), declination,
+    local_field_sd of the hypothesis, gyro_delay, gyro_delay_sd, mag_delay_sd (s; zero where a delay is taken as known), declination,
     heading_sd (rad), frame_from_enu (4,), use_acc and rest_force (m/s^2; with gyro_mag neither
     the filter nor its rest detector looks at the accelerometer), follows_field, as_printed.
     """
+    hypotheses = params.fusion.local_field_sd if params.method == "fusion" else (
+        params.fusion.local_field_sd[:1])
+    return np.concatenate([_hypothesis(params, value) for value in hypotheses])
+
+
+def _hypothesis(params: OrientationParams, local_field_sd: float) -> np.ndarray:
     s = params.sensor
     with_acc = params.method == "fusion"
     return record(
         params,
+        local_field_sd=local_field_sd,
         gyro_delay=s.gyro_delay or 0.0,
         gyro_delay_sd=s.gyro_delay_sd if s.gyro_delay is None else 0.0,
         mag_delay_sd=s.mag_delay_sd if s.mag_delay is None else 0.0,

@@ -1,7 +1,7 @@
 """What the kernels remember: every number by name, shape, unit and meaning.
 
-One state for both methods, a one-element structured array: a kernel takes it as ``state``,
-works on ``s = state[0]``, and a snapshot is one copy. Parts that belong to one module are
+One state for both methods, a structured array of one element per hypothesis (bank): a kernel takes
+it as ``state``, works on ``s = state[k]``, and a snapshot is one copy. Parts that belong to one module are
 records of their own. Rates are rad/s in imu axes, specific forces m/s^2, stamps int64 ns;
 ``raw`` is as the sensor reports it.
 """
@@ -168,6 +168,6 @@ STATE = np.dtype([
 """The whole state, zeroed at the start."""
 
 
-def new_state() -> np.ndarray:
-    """A state before its first sample, (1,)."""
-    return np.zeros(1, STATE)
+def new_state(hypotheses: int = 1) -> np.ndarray:
+    """A state before its first sample, (hypotheses,)."""
+    return np.zeros(hypotheses, STATE)

@@ -46,7 +46,7 @@ def start_field(s, p, z, has_heading, follow):
     for i in range(es.FIELD, es.MAG_OFFSET):
         cov[i, :] = 0.0
         cov[:, i] = 0.0
-        cov[i, i] = 1.0 if i < es.LOCAL_FIELD else p.fusion.local_field_sd ** 2
+        cov[i, i] = 1.0 if i < es.LOCAL_FIELD else p.local_field_sd ** 2
     if has_heading:
         cov[es.ATTITUDE + 2, es.ATTITUDE + 2] += follow
         # What is left of hard and soft iron turns the needle and stays in the heading.

@@ -1,0 +1,174 @@
+"""A bank of hypotheses: the same filter under each, and what they say together.
+
+What is not known of a recording beforehand, such as how much the field of a place differs from its
+surroundings, is no number to be tuned but a few hypotheses that the samples decide between: each
+has a state and parameters of its own, is handed the same samples, and keeps the log likelihood of
+its measurements (multiple-model estimation: Bar-Shalom, Li, Kirubarajan 2001, 11.6, with models
+that do not switch). What comes out is the mixture with its mean and its covariance, so that a
+disagreement between hypotheses that are about as likely is part of the covariance.
+"""
+
+import math
+
+import numpy as np
+
+from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.estimation.orientation import fusion
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+from imu_fusion.geometry.rotation import (
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_normalize,
+    quat_to_matrix,
+)
+from imu_fusion.kernels import njit
+
+# Innovations of one disturbance repeat each other: blocks of 20 ms are taken as white by the
+# filter, while what moves the innovations lasts as long as the local field does, 0.3 s. The log
+# likelihood counts them once.
+_REPEATS = 15.0
+_NEGLIGIBLE = 1e-6         # weight of a hypothesis that changes nothing any more
+_NO_TAPE = np.empty(0, es.TAPE)
+
+
+@njit
+def step(state, par, stamp, sample, row):
+    """:func:`fusion.step` of every hypothesis; ``row`` gets their mixture.
+
+    Args:
+        state, par: (k,), one element per hypothesis; state in place.
+        stamp, sample: of fusion.step.
+        row: the output row.
+    """
+    if len(state) == 1 or (state[0].field_norm == 0.0 and state[0].queue.count == 0):
+        # Without a magnetometer the hypotheses are one.
+        return fusion.step(state[0], par[0], stamp, sample, row, _NO_TAPE)
+    part(state)
+    rows = np.empty(len(state), ORIENTATION_DTYPE)
+    result = 0
+    for k in range(len(state)):
+        result = fusion.step(state[k], par[k], stamp, sample, rows[k], _NO_TAPE)
+    if result > 0:
+        mix(rows, weights(state), row)
+    return result
+
+
+@njit
+def part(state):
+    """Let hypotheses go on from the first one that were one with it so far."""
+    for k in range(1, len(state)):
+        if state[k].stamp != state[0].stamp:
+            state[k] = state[0]
+
+
+@njit
+def weights(state):
+    """Weights (k,) of the hypotheses by what was measured so far; the sum is 1, those that are
+    negligible, or still one with the first, are 0."""
+    out = np.zeros(len(state))
+    largest = -math.inf
+    for k in range(len(state)):
+        if state[k].stamp == state[0].stamp:
+            largest = max(largest, state[k].log_likelihood)
+    total = 0.0
+    for k in range(len(state)):
+        if state[k].stamp == state[0].stamp:
+            weight = math.exp((state[k].log_likelihood - largest) / _REPEATS)
+            out[k] = weight if weight > _NEGLIGIBLE else 0.0
+        total += out[k]
+    return out / total
+
+
+@njit
+def likeliest(weight):
+    """Index of the largest weight."""
+    best = 0
+    for k in range(1, len(weight)):
+        if weight[k] > weight[best]:
+            best = k
+    return best
+
+
+@njit
+def mix(rows, weight, row):
+    """Write the mixture of rows (k,) ORIENTATION_DTYPE with weights (k,) to ``row``.
+
+    Attitude and numbers are means, covariances those of the mixture: the mean one and the spread
+    of the means. Stamp, flags and what belongs to the sample are the likeliest row's.
+    """
+    best = likeliest(weight)
+    row.stamp, row.flags = rows[best].stamp, rows[best].flags
+    row.mag_count, row.reliability = rows[best].mag_count, rows[best].reliability
+    for i in range(4):
+        row.quat_world_imu[i] = rows[best].quat_world_imu[i]
+    for i in range(3):
+        row.gyr[i], row.acc[i] = rows[best].gyr[i], rows[best].acc[i]
+        row.gyr_bias[i], row.gyr_bias_sd[i] = rows[best].gyr_bias[i], rows[best].gyr_bias_sd[i]
+        row.mag_world[i] = rows[best].mag_world[i]
+        for j in range(3):
+            row.cov_attitude[i, j] = rows[best].cov_attitude[i, j]
+            row.cov_gyr[i, j] = rows[best].cov_gyr[i, j]
+            row.cov_acc[i, j] = rows[best].cov_acc[i, j]
+    if weight[best] < 1.0:
+        _mix_attitude(rows, weight, best, row)
+        _mix_bias(rows, weight, row)
+
+
+@njit
+def _mix_attitude(rows, weight, best, row):
+    """Mean attitude and its covariance, about the likeliest row's."""
+    back = quat_conjugate(rows[best].quat_world_imu)
+    off = np.empty((len(rows), 3))
+    mean = np.zeros(3)
+    for k in range(len(rows)):
+        apart = quat_log(quat_normalize(quat_multiply(back, rows[k].quat_world_imu)))
+        for i in range(3):
+            off[k, i] = apart[i]
+            mean[i] += weight[k] * apart[i]
+    cov = np.zeros((3, 3))
+    for k in range(len(rows)):
+        # From the axes of this row to those of the mean.
+        r = quat_to_matrix(quat_exp((off[k, 0] - mean[0], off[k, 1] - mean[1],
+                                     off[k, 2] - mean[2]), 1.0))
+        own = rows[k].cov_attitude
+        for i in range(3):
+            for j in range(3):
+                part = (off[k, i] - mean[i]) * (off[k, j] - mean[j])
+                for a in range(3):
+                    for b in range(3):
+                        part += r[i, a] * own[a, b] * r[j, b]
+                cov[i, j] += weight[k] * part
+    row.quat_world_imu[:] = quat_normalize(quat_multiply(rows[best].quat_world_imu,
+                                                         quat_exp(mean, 1.0)))
+    row.cov_attitude[:] = cov
+
+
+@njit
+def _mix_bias(rows, weight, row):
+    """Mean bias, and the rates and forces that follow from it, with their variances."""
+    for i in range(3):
+        bias = rate = force = 0.0
+        for k in range(len(rows)):
+            bias += weight[k] * rows[k].gyr_bias[i]
+            rate += weight[k] * rows[k].gyr[i]
+            force += weight[k] * rows[k].acc[i]
+        variance = var_rate = var_force = 0.0
+        for k in range(len(rows)):
+            variance += weight[k] * (rows[k].gyr_bias_sd[i] ** 2 + (rows[k].gyr_bias[i] - bias) ** 2)
+            var_rate += weight[k] * (rows[k].cov_gyr[i, i] + (rows[k].gyr[i] - rate) ** 2)
+            var_force += weight[k] * (rows[k].cov_acc[i, i] + (rows[k].acc[i] - force) ** 2)
+        row.gyr_bias[i], row.gyr[i], row.acc[i] = bias, rate, force
+        row.gyr_bias_sd[i] = math.sqrt(variance)
+        row.cov_gyr[i, i], row.cov_acc[i, i] = var_rate, var_force
+
+
+@njit
+def mix_all(rows, weight, out):
+    """:func:`mix` of rows (k, n) with the same weights (k,), to ``out`` (n,)."""
+    here = np.empty(len(rows), ORIENTATION_DTYPE)
+    for n in range(len(out)):
+        for k in range(len(rows)):
+            here[k] = rows[k, n]
+        mix(here, weight, out[n])
