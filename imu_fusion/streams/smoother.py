@@ -155,12 +155,13 @@ class SmootherStream(Stream):
                 for topic, parts in self._collected.items() if parts}
 
     def conclude(self) -> Conclusion:
-        """What the samples of a whole recording make: the smoothed trajectory."""
+        """What the samples of a whole recording make: the smoothed trajectory; its detail is
+        (SmootherResult, logs by topic)."""
         logs = self.logs()
         result = smooth(self.params, logs)
         outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
         return Conclusion(messages(result.samples, outcome, self.params.path_rate),
-                          outcome.numbers, outcome.summary, outcome.remarks)
+                          outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
 
 
 def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
