@@ -207,6 +207,11 @@ class MagCalibrator:
         self._count += 1
         return True
 
-    def result(self) -> MagCalibration:
-        """MagCalibration of what was kept so far. Raises CalibrationError as the batch fit."""
-        return calibrate_magnetometer(self._kept[:self._count], self._field_norm)
+    def result(self, limit: ArrayLike = np.inf) -> MagCalibration:
+        """MagCalibration of what was kept so far. Raises CalibrationError as the batch fit.
+
+        limit: tesla, scalar or (3,): samples with an axis at or beyond it are left out.
+        """
+        kept = self._kept[:self._count]
+        below = (np.abs(kept) < limit).all(axis=1)
+        return calibrate_magnetometer(kept[below], self._field_norm)
