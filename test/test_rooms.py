@@ -63,8 +63,9 @@ COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses"
              "enum", "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib",
              "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}
 COMPUTING_OF_FILES = {
+    "parameters/bounded_yaml.py": {"pathlib", "yaml"},
     "parameters/file.py": {"pathlib", "yaml"},
-    "surfaces/file.py": {"pathlib", "sys", "yaml"},
+    "surfaces/file.py": {"pathlib", "sys"},
     "surfaces/elevation_grid.py": {"pyproj", "rasterio"},    # a terrain is a file
     "kernels.py": {"hashlib", "os", "pathlib", "pickle", "re", "shutil", "sys", "tempfile", "time"},
 }
