@@ -19,6 +19,7 @@ ROS, YAML and messages, ``params.sensor.gyro_noise_density`` in Python. A field 
 """
 
 import dataclasses
+import functools
 import math
 import reprlib
 import types
@@ -301,10 +302,11 @@ class Parameters:
         return dataclasses.replace(self, **own)
 
 
-def fields_of(cls: type) -> list[tuple[dataclasses.Field, Any]]:
+@functools.cache
+def fields_of(cls: type) -> tuple[tuple[dataclasses.Field, Any], ...]:
     """(dataclass field, its annotation) of each field, in order."""
     hints = typing.get_type_hints(cls)
-    return [(field, hints[field.name]) for field in dataclasses.fields(cls)]
+    return tuple((field, hints[field.name]) for field in dataclasses.fields(cls))
 
 
 def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
@@ -312,6 +314,7 @@ def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
     return isinstance(kind, type) and issubclass(kind, Parameters)
 
 
+@functools.cache
 def _info(field: dataclasses.Field, kind: Any) -> ParameterInfo:
     element, is_tuple, optional = split_type(kind)
     return ParameterInfo(name=field.name, kind=kind, element=element, is_tuple=is_tuple,
