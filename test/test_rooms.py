@@ -185,7 +185,7 @@ def test_a_planted_import_is_found(path, source):
 
 
 @pytest.mark.parametrize("path, source", [
-    ("nodes/base.py", "import rclpy"), ("surfaces/file.py", "import yaml"),
+    ("nodes/base.py", "import rclpy"), ("parameters/bounded_yaml.py", "import yaml"),
     ("estimation/smoother/motion.py", "from imu_fusion.surfaces.plane import Plane"),
     ("report/html.py", "import imu_fusion"), ("geometry/rotation.py", "import numpy as np"),
 ])
