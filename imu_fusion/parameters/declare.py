@@ -21,6 +21,7 @@ ROS, YAML and messages, ``params.sensor.gyro_noise_density`` in Python. A field 
 import dataclasses
 import functools
 import math
+import reprlib
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -117,7 +118,7 @@ class ParameterInfo:
             allowed = f"; allowed: {bounds}" if bounds else ""
             unit = f" {self.unit}" if self.unit else ""
             raise ParameterError(
-                f"parameter '{self.name}'{where}: {value!r} {why}{allowed}{unit}")
+                f"parameter '{self.name}'{where}: {reprlib.repr(value)} {why}{allowed}{unit}")
 
         if self._is_unset(value):
             return None if self.optional else ()
@@ -153,7 +154,10 @@ class ParameterInfo:
             return value
         if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
             refuse(f"is not {'an integer' if self.element is int else 'a number'}")
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:    # an integer of hundreds of digits
+            refuse("is out of bounds")
         if math.isnan(number):
             refuse("is not a number")
         if self.element is int:
