@@ -51,7 +51,7 @@ class Flow:
         self.peers = Peers(node, own, self._changed, self._problem)
         self.source = Source(
             node, self.peers, own, gid[:PARTICIPANT], wait_for=wait_for, say=self._say,
-            upstream=lambda: self.sink.company() if relays else set(), problem=self._problem)
+            upstream=(lambda: self.sink.company()) if relays else None, problem=self._problem)
         self.sink = Sink(
             node, self.peers, own, gid[:PARTICIPANT], hold=hold, on_begin=on_begin,
             on_join=self._join, gate=lambda: not relays or self.source.ready(),

@@ -19,7 +19,7 @@ WINDOW = 500  # messages sent before all must be acknowledged; half the depth of
 WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
-GETTING_KNOWN = 1.0  # s, in which a new subscriber may turn out to be one of our nodes
+SETTLING = 1.0  # s without anybody new, after which all who are there are taken to be known
 
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # as rmw calls it
 AT_ONCE = Duration(nanoseconds=0)
@@ -104,23 +104,27 @@ class Source:
         peers: the other instances.
         own: topic of this node's state, its instance; ``participant``: how its gids begin.
         wait_for: names of nodes that must have joined before the first message.
-        upstream: returns the instances that those know whose sessions this node processes.
+        upstream: returns the instances that those know whose sessions this node processes;
+            None for a node that processes none.
         say: called when :attr:`sending` has changed.
         problem: called with a text for the user.
     """
 
     def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
-                 wait_for: Collection[str], upstream: Callable[[], set[str]],
+                 wait_for: Collection[str], upstream: Callable[[], set[str]] | None,
                  say: Callable[[], None], problem: Callable[[str], None]) -> None:
         self.node, self.participant = node, participant
         self.outputs: dict[str, Output] = {}
         self.phase = _LIVE
         self.lost = 0  # see Sending
         self.foreign: dict[str, list[str]] = {}
-        self._unknown_since: dict[str, float] = {}  # gid of a reader -> time
         self._peers, self._own = peers, own
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
         self._upstream, self._say, self._problem = upstream, say, problem
+        # Nobody says who will be there: only time tells.
+        self._asks_around = upstream is None and not wait_for
+        self._seen: set[str] = set()  # peers, and gids of readers that may be of others
+        self._news_at = time.monotonic() if self._asks_around else float("-inf")
         self._session = ""
         self.company: set[str] = set()  # instances that must have joined
         self._version = 0
@@ -212,10 +216,11 @@ class Source:
 
     def look(self, anew: bool = False) -> None:
         """Compare with the graph: who listens, who has come, who has gone."""
-        self._look_for_strangers()
+        self._look_around()
         if self.phase in (_JOINING, _OPEN):
-            known = self._upstream() | {
-                p.instance for p in self._peers.values() if p.state and p.state.listens}
+            known = {p.instance for p in self._peers.values() if p.state and p.state.listens}
+            if self._upstream is not None:
+                known |= self._upstream()
             if anew or known - self.company:
                 self.company |= known
                 self._version += 1
@@ -286,8 +291,7 @@ class Source:
         """All have answered, and the readers that they speak of are matched."""
         if (self._waiting() or self._wait_for - self._names()
                 or any(peer.is_silent for peer in self._peers.values())
-                or any(time.monotonic() - since < GETTING_KNOWN
-                       for since in self._unknown_since.values())):
+                or time.monotonic() - self._news_at < SETTLING):
             return False
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
@@ -300,19 +304,20 @@ class Source:
                 return False
         return True
 
-    def _look_for_strangers(self):
-        """Find out who subscribes and is not, or not yet, known as one of ours."""
+    def _look_around(self):
+        """Who subscribes and is not, or not yet, known as one of ours; when was anybody new?"""
         ours = {peer.name for peer in self._peers.values() if peer.state}
         ours.add(self.node.get_fully_qualified_name())
-        since: dict = {}
+        seen = set(self._peers) if self._asks_around else set()
         self.foreign = {}
         for topic in self.outputs:
             others = [info for info in self.node.get_subscriptions_info_by_topic(topic)
                       if full_name(info) not in ours]
-            since |= {gid(info): time.monotonic() for info in others}
+            seen |= set(map(gid, others))
             # A node's endpoints are discovered before its name.
             names = {full_name(info) for info in others if info.node_name != UNKNOWN_NODE}
             if names:
                 self.foreign[topic] = sorted(names)
-        self._unknown_since = since | {
-            g: t for g, t in self._unknown_since.items() if g in since}
+        if seen - self._seen:
+            self._news_at = time.monotonic()
+        self._seen = seen
