@@ -88,7 +88,7 @@ class Replayer(Node):
             Clock, "/clock", reliable_qos(10)) if p.clock else None
         self._next_clock = 0
         self._from = self._start  # where the next session begins
-        self._seek = None  # where it is to begin as soon as this one has ended
+        self._seek: int | None = None  # where it is to begin as soon as this one has ended
         self._messages: Iterator[tuple[str, str, int, bytes]] = iter(())
         self._next = None  # (topic, log time, bytes) that is due next
         self._phase = self._wait
@@ -114,7 +114,7 @@ class Replayer(Node):
             self.finished = True
         self._flow.send()
         if self._seek is not None:
-            self._jump()
+            self._jump(self._seek)
         return self._flow.pause(self._phase())
 
     def apply(self, params: Mapping[type[Parameters], Parameters]) -> None:
@@ -174,9 +174,9 @@ class Replayer(Node):
                              + (", ".join(self._bag.topics) or "no topics"))
         return publishers
 
-    def _jump(self):
+    def _jump(self, log_time):
         """End this session; the next one begins elsewhere."""
-        self._from, self._seek = self._seek, None
+        self._from, self._seek = log_time, None
         self.set_parameters([Parameter("seek", value=math.nan)])  # can be set to the same again
         if self._phase in (self._join, self._play):
             self._end(NEXT)
