@@ -17,6 +17,7 @@ from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.results import write_results
+from imu_fusion.recordings.targets import refuse_source
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.stage import Stage, StageReport
@@ -113,6 +114,7 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
     for name in without:
         if name not in STAGES:
             raise TopicError(f"no estimator '{name}'; there are: {', '.join(STAGES)}")
+    refuse_source(bag, out)
     with open_bag(bag) as reader:
         reports, chosen = _choose(reader, params_file, without, remap or {})
         if not chosen:
@@ -122,7 +124,8 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
                   for topic, name in names.items()}
         progress(f"reading {', '.join(sorted({name for name, _ in wanted}))} from "
                  f"{Path(bag).name}")
-        with BagWriter(out, overwrite=overwrite) as writer, announced_compiling(progress):
+        with (BagWriter(out, overwrite=overwrite, whole=True) as writer,
+              announced_compiling(progress)):
             feeds = [_Feed(*one, writer) for one in chosen]
             for block in _blocks(reader, wanted):
                 for feed in feeds:

@@ -20,10 +20,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
 
 import numba
+import numpy as np
 from numba.core import compiler, event, serialize
 from numba.core.caching import _Cache
 from numba.core.registry import cpu_target
@@ -38,12 +39,45 @@ _KEPT = 30 * 86400.0       # s, that compiled code of another source is kept wit
 
 
 def njit(function: Callable) -> Callable:
-    """Compile a function with numba, strict floating point, cached as this module says."""
+    """Compile a function with numba, strict floating point, cached as this module says.
+
+    With NUMBA_DISABLE_JIT it is interpreted, for debuggers and for coverage.
+    """
+    if numba.config.DISABLE_JIT:
+        return _interpreted(function)
     dispatcher = numba.njit(fastmath=False)(function)
     directory = _directory(Path(function.__code__.co_filename))
     if directory is not None:
         dispatcher._cache = _KernelCache(function, directory)  # type: ignore[attr-defined]
     return dispatcher
+
+
+def _interpreted(function: Callable) -> Callable:
+    """The function in plain Python, where fields of records are attributes, as in numba."""
+    names = function.__globals__
+    names |= {name: np.dtype((_Record, value)) for name, value in names.items()
+              if isinstance(value, np.dtype) and value.names}
+
+    @wraps(function)
+    def call(*arguments):
+        return function(*(a.view(np.dtype((_Record, a.dtype)))
+                          if isinstance(a, np.ndarray | np.void) and a.dtype.names else a
+                          for a in arguments))
+    return call
+
+
+class _Record(np.void):
+    """An element of a structured array. numpy's own would give its methods (max, cov) first."""
+
+    def __getattribute__(self, name):
+        dtype = super().__getattribute__("dtype")
+        if name not in (dtype.names or ()):
+            return super().__getattribute__(name)
+        value = self[name]
+        return value.view(np.dtype((_Record, value.dtype))) if dtype[name].names else value
+
+    def __setattr__(self, name, value):
+        self[name] = value
 
 
 def entry_point(kernel: Callable, *arguments: object) -> Callable:
@@ -52,6 +86,8 @@ def entry_point(kernel: Callable, *arguments: object) -> Callable:
     A call of a kernel looks its arguments' types up, which costs 3 us where some are structured
     arrays; a call of what this returns does not. It takes arguments of just these types.
     """
+    if numba.config.DISABLE_JIT:
+        return kernel
     return kernel.compile(  # type: ignore[attr-defined]
         tuple(numba.typeof(argument) for argument in arguments))
 

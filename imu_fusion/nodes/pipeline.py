@@ -14,6 +14,7 @@ from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.results import write_results
+from imu_fusion.recordings.targets import refuse_source
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
 
@@ -99,6 +100,7 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     Raises:
         ImuFusionError: recording, parameters or topics are not usable, or a node failed.
     """
+    refuse_source(bag, out)
     plan = plan_pipeline(bag, params_file, without, remap)
     file = Path(params_file).absolute() if params_file else None
     with NodeProcesses(logs) as nodes:

@@ -16,10 +16,7 @@ from rosbags.typesys.store import Typestore
 from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.recordings.qos import qos_profile
-from imu_fusion.recordings.results import RESULTS_FILE
-
-# What we write into the directory of a recording beside its files.
-_BESIDE = ("metadata.yaml", RESULTS_FILE, "report.html")
+from imu_fusion.recordings.targets import LIBRARY, METADATA_FILE, why_not_replaced
 
 
 class _Dumper(yaml.SafeDumper):
@@ -33,13 +30,17 @@ class BagWriter:
     """Write a rosbag2 directory: ``<directory>/<name>_0.mcap`` and ``metadata.yaml``.
 
     A chunk is on its way to the disk as soon as it is complete, so that a crash
-    loses at most the open one.
+    loses at most the open one. With ``whole`` the recording appears at its place complete, by
+    renaming, or not at all: for what can be made again. What is replaced goes once the new one is
+    complete.
 
     Args:
-        directory: must not exist or be empty, unless ``overwrite``.
+        directory: must not exist or be empty, unless ``overwrite``. The attribute ``directory``
+            is where files are written now.
         compression: ``zstd``, ``lz4`` or ``none``.
         chunk_size: bytes of messages per chunk.
-        overwrite: replace what is there, if it is a recording.
+        overwrite: replace what is there, if it is a recording and nothing else.
+        whole: see above; leaving the context by an exception leaves everything as it was.
         typestore: source of message definitions; Jazzy's by default.
 
     Raises:
@@ -48,8 +49,11 @@ class BagWriter:
 
     def __init__(self, directory: str | Path, compression: str = "zstd",
                  chunk_size: int = 256 * 1024, overwrite: bool = False,
-                 typestore: Typestore = TYPES):
-        self.directory = Path(directory)
+                 typestore: Typestore = TYPES, whole: bool = False):
+        self._target = Path(directory).resolve()
+        self.directory = self._target
+        self._replaced: Path | None = None    # where what was there is kept until the end
+        self._whole = whole
         self.counts: Counter[str] = Counter()
         self._typestore = typestore
         self._channels: dict[str, int] = {}
@@ -58,39 +62,80 @@ class BagWriter:
         self._last: int | None = None
         self._sequence: Counter[str] = Counter()
         self._prepare(overwrite)
-        name = self.directory.resolve().name
-        self._file = f"{name}_0.mcap"
+        self._file = f"{self._target.name}_0.mcap"
         try:
             self._stream = open(self.directory / self._file, "wb")  # noqa: SIM115, closed by close
         except OSError as error:
-            raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
+            self._restore()
+            raise BagError(f"{self._target}: cannot be written ({error.strerror})") from None
         self._position = 0
         self._writer = mcap.writer.Writer(
             self._stream, chunk_size=chunk_size,
             compression=mcap.writer.CompressionType[compression.upper()])
-        self._writer.start(profile="ros2", library="imu_fusion")
+        self._writer.start(profile="ros2", library=LIBRARY)
         self._flush()
 
     def _prepare(self, overwrite):
+        target = self._target
         try:
-            if self.directory.exists():
-                if not self.directory.is_dir():
-                    raise BagError(f"{self.directory}: is a file, not a directory to record into")
-                present = sorted(p.name for p in self.directory.iterdir())
-                ours = all(p in _BESIDE or p.endswith((".mcap", ".db3")) for p in present)
-                if present and not (overwrite and ours):
-                    raise BagError(f"{self.directory}: exists and is not empty; choose another "
-                                   "directory" + ("" if ours else " (it holds other files)"))
-                shutil.rmtree(self.directory)
-            self.directory.mkdir(parents=True)
+            occupied = os.path.lexists(target)
+            if occupied and not target.is_dir():
+                raise BagError(f"{target}: is a file, not a directory to record into")
+            occupied = occupied and any(target.iterdir())
+            if occupied:
+                why = why_not_replaced(target)
+                if why or not overwrite:
+                    raise BagError(f"{target}: exists and is not empty; choose another directory"
+                                   + (f" ({why})" if why else ""))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if self._whole:
+                # Inside of an empty directory that is there: it may be a mount point.
+                inside = target.is_dir() and not occupied
+                self.directory = target / ".part" if inside else self._beside("part")
+                self.directory.mkdir()
+            else:
+                if occupied:
+                    self._put_aside()
+                target.mkdir(exist_ok=True)
         except OSError as error:
-            raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
+            raise BagError(f"{target}: cannot be written ({error.strerror})") from None
+
+    def _beside(self, what):
+        return self._target.with_name(f".{self._target.name}.{what}-{os.getpid()}")
+
+    def _put_aside(self):
+        self._replaced = self._beside("replaced")
+        os.rename(self._target, self._replaced)
+
+    def _restore(self):
+        """Everything as it was before."""
+        with contextlib.suppress(OSError):
+            shutil.rmtree(self.directory)
+        if self._replaced is not None:
+            os.rename(self._replaced, self._target)
+
+    def _appear(self):
+        """Put the complete recording at its place; let go of what it replaces."""
+        if self.directory.parent == self._target:
+            for file in sorted(self.directory.iterdir(), key=lambda f: f.name == METADATA_FILE):
+                os.replace(file, self._target / file.name)
+            self.directory.rmdir()
+        elif self._whole:
+            if self._target.exists():
+                self._put_aside()
+            os.rename(self.directory, self._target)
+        self.directory = self._target
+        if self._replaced is not None:
+            shutil.rmtree(self._replaced)
 
     def __enter__(self) -> "BagWriter":
         return self
 
-    def __exit__(self, *_):
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_):
+        if kind is not None and self._whole:
+            self.abandon()
+        else:
+            self.close()
 
     def add_topic(self, topic: str, msgtype: str, qos: list[dict] | None = None,
                   definition: tuple[str, str] | None = None) -> None:
@@ -101,7 +146,7 @@ class BagWriter:
             definition: (ros2msg text, RIHS01 hash) of a type that Jazzy does not have.
         """
         if not topic.startswith("/"):
-            raise BagError(f"{self.directory}: topic '{topic}' must be absolute in a recording: "
+            raise BagError(f"{self._target}: topic '{topic}' must be absolute in a recording: "
                            f"'/{topic}'")
         qos = [qos_profile()] if qos is None else qos
         if definition is None:
@@ -135,7 +180,7 @@ class BagWriter:
         if topic not in self._channels:
             self.add_topic(topic, msgtype, qos, definition)
         elif self._topics[topic]["type"] != msgtype:
-            raise BagError(f"{self.directory}: topic {topic} is {self._topics[topic]['type']}, "
+            raise BagError(f"{self._target}: topic {topic} is {self._topics[topic]['type']}, "
                            f"not {msgtype}")
         try:
             self._writer.add_message(self._channels[topic], log_time, bytes(cdr),
@@ -143,8 +188,8 @@ class BagWriter:
                                      self._sequence[topic])
             self._flush()
         except OSError as error:
-            raise BagError(f"{self.directory}: writing failed ({error.strerror}); what was "
-                           "written before stays readable") from error
+            raise BagError(f"{self._target}: writing failed ({error.strerror}); "
+                           + self._what_stays()) from error
         self._sequence[topic] += 1
         self.counts[topic] += 1
         self._first = log_time if self._first is None else min(self._first, log_time)
@@ -174,17 +219,26 @@ class BagWriter:
             self._stream.flush()
             os.fsync(self._stream.fileno())
             self._write_metadata(information)
+            self._stream.close()
+            self._appear()
         except OSError as error:
-            raise BagError(f"{self.directory}: closing failed ({error.strerror}); complete "
-                           "chunks stay readable") from error
-        finally:
-            with contextlib.suppress(OSError):  # reported above
-                self._stream.close()
+            self.abandon()
+            raise BagError(f"{self._target}: closing failed ({error.strerror}); "
+                           + self._what_stays()) from error
 
     def abandon(self) -> None:
-        """Close the file as it is, after an error: no index, chunks stay readable."""
+        """After an error. A ``whole`` recording vanishes, and what was there before stays. Of
+        another one the file stays as it is, without index, its chunks readable."""
         with contextlib.suppress(OSError):
             self._stream.close()
+        if self._whole and self.directory != self._target:
+            self._restore()
+
+    def _what_stays(self):
+        if self._whole:
+            return "nothing was written"
+        kept = f", and what it replaces at {self._replaced}" if self._replaced else ""
+        return "what was written before stays readable" + kept
 
     def _information(self):
         """What rosbag2 calls the bag's metadata."""
@@ -205,7 +259,7 @@ class BagWriter:
 
     def _write_metadata(self, information):
         # Under another name first: a metadata.yaml that exists is complete.
-        temporary = self.directory / "metadata.yaml.part"
+        temporary = self.directory / f"{METADATA_FILE}.part"
         temporary.write_text(yaml.dump({"rosbag2_bagfile_information": information},
                                        Dumper=_Dumper, sort_keys=False))
-        os.replace(temporary, self.directory / "metadata.yaml")
+        os.replace(temporary, self.directory / METADATA_FILE)
