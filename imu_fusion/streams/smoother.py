@@ -112,6 +112,9 @@ class SmoothingParams(SmootherParams):
 class SmootherNodeParams(EstimatorNodeParams):
     """What concerns the node, not the trajectory."""
 
+    smooth_at_end: bool = param(
+        False, doc="Smooth when a replay has ended, as if smoother/smooth were called. A refusal, "
+        "and a replay that plays not enough or breaks off, end the node with code 1.")
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
                                     "taken, and smoothing is refused until smoother/clear. Imu "
