@@ -233,11 +233,14 @@ def convert(source: str, out: str, topics: tuple[str, ...], description: str | N
         return
     from imu_fusion.recordings.bag_reader import open_bag
     from imu_fusion.recordings.bag_writer import BagWriter
+    from imu_fusion.recordings.targets import refuse_source
+    refuse_source(source, out)
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
         renamed = {reader.require(other).name: name for other, name in names.items()}
-        with (BagWriter(out, overwrite=overwrite, typestore=reader.typestore) as writer,
+        with (BagWriter(out, overwrite=overwrite, typestore=reader.typestore,
+                        whole=True) as writer,
               click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
                                 length=sum(reader.topics[t].count or 0 for t in kept),
                                 file=sys.stderr) as messages):
@@ -306,7 +309,9 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
     recording of --estimates) holds imu/data. A reference in BAG shows the errors.
     """
     from imu_fusion.kernels import announced_compiling
+    from imu_fusion.recordings.targets import refuse_files
     from imu_fusion.report.recording import write_recording_report
+    refuse_files([bag, estimates, params_file], out)
     with announced_compiling(lambda text: click.echo(text, err=True)):
         write_recording_report(bag, estimates, out, params_file)
     click.echo(f"written: {out}")

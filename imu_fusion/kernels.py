@@ -20,10 +20,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
 
 import numba
+import numpy as np
 from numba.core import compiler, event, serialize
 from numba.core.caching import _Cache
 from numba.core.registry import cpu_target
@@ -34,16 +35,50 @@ _PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+(imu_fusion[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)"
                      rb"|import[ \t]+(imu_fusion[\w.]*))", re.MULTILINE)
 _COMMENT = re.compile(rb"#[^\n]*")
+_INTERPRETED = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 _KEPT = 30 * 86400.0       # s, that compiled code of another source is kept without being written
 
 
 def njit(function: Callable) -> Callable:
-    """Compile a function with numba, strict floating point, cached as this module says."""
+    """Compile a function with numba, strict floating point, cached as this module says.
+
+    With NUMBA_DISABLE_JIT it is interpreted, for debuggers and for coverage.
+    """
+    if _INTERPRETED:
+        return _interpreted(function)
     dispatcher = numba.njit(fastmath=False)(function)
     directory = _directory(Path(function.__code__.co_filename))
     if directory is not None:
         dispatcher._cache = _KernelCache(function, directory)  # type: ignore[attr-defined]
     return dispatcher
+
+
+def _interpreted(function: Callable) -> Callable:
+    """The function in plain Python, where fields of records are attributes, as in numba."""
+    names = function.__globals__
+    names |= {name: np.dtype((_Record, value)) for name, value in names.items()
+              if isinstance(value, np.dtype) and value.names}
+
+    @wraps(function)
+    def call(*arguments):
+        return function(*(a.view(np.dtype((_Record, a.dtype)))
+                          if isinstance(a, np.ndarray | np.void) and a.dtype.names else a
+                          for a in arguments))
+    return call
+
+
+class _Record(np.void):     # type: ignore[misc]
+    """An element of a structured array. numpy's own would give its methods (max, cov) first."""
+
+    def __getattribute__(self, name):
+        dtype = super().__getattribute__("dtype")
+        if name not in (dtype.names or ()):
+            return super().__getattribute__(name)
+        value = self[name]
+        return value.view(np.dtype((_Record, value.dtype))) if dtype[name].names else value
+
+    def __setattr__(self, name, value):
+        self[name] = value
 
 
 def entry_point(kernel: Callable, *arguments: object) -> Callable:
@@ -52,6 +87,8 @@ def entry_point(kernel: Callable, *arguments: object) -> Callable:
     A call of a kernel looks its arguments' types up, which costs 3 us where some are structured
     arrays; a call of what this returns does not. It takes arguments of just these types.
     """
+    if _INTERPRETED:
+        return kernel
     return kernel.compile(  # type: ignore[attr-defined]
         tuple(numba.typeof(argument) for argument in arguments))
 
@@ -158,10 +195,15 @@ def _directory(file: Path) -> Path | None:
     """Where the compiled functions of a file are, None if nowhere."""
     if not (file.exists() and file.is_relative_to(_PACKAGE)):
         return None    # typed in, or somebody else's
+    return cache_file(f"{file.stem}-{_version_of(file)[:24]}")
+
+
+@cache
+def _version_of(file: Path) -> str:
+    """A digest of all that the machine code of a file's kernels depends on."""
     sources = b"".join(str(f.relative_to(_PACKAGE.parent)).encode() + _digest(f)
                        for f in sorted(sources_of(file)))
-    digest = hashlib.sha256(versions().encode() + sources).hexdigest()
-    return cache_file(f"{file.stem}-{digest[:24]}")
+    return hashlib.sha256(versions().encode() + sources).hexdigest()
 
 
 def versions() -> str:

@@ -55,7 +55,7 @@ def _write_withheld(reader, path):
     stretches = [(first + round(start * 1e9), first + round((start + _LENGTH) * 1e9))
                  for start in np.linspace(_FIRST, duration + _LAST, _COUNT)]
     gnss = {f"/{FIX_TOPIC}", f"/{VELOCITY_TOPIC}"}
-    with BagWriter(path, overwrite=True) as writer:
+    with BagWriter(path, overwrite=True, whole=True) as writer:
         for topic, msgtype, stamp, cdr in reader.messages():
             if topic not in gnss or not any(a <= stamp < b for a, b in stretches):
                 writer.write(topic, msgtype, cdr, stamp)

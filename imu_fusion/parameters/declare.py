@@ -19,7 +19,9 @@ ROS, YAML and messages, ``params.sensor.gyro_noise_density`` in Python. A field 
 """
 
 import dataclasses
+import functools
 import math
+import reprlib
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -116,7 +118,7 @@ class ParameterInfo:
             allowed = f"; allowed: {bounds}" if bounds else ""
             unit = f" {self.unit}" if self.unit else ""
             raise ParameterError(
-                f"parameter '{self.name}'{where}: {value!r} {why}{allowed}{unit}")
+                f"parameter '{self.name}'{where}: {reprlib.repr(value)} {why}{allowed}{unit}")
 
         if self._is_unset(value):
             return None if self.optional else ()
@@ -152,7 +154,10 @@ class ParameterInfo:
             return value
         if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
             refuse(f"is not {'an integer' if self.element is int else 'a number'}")
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:    # an integer of hundreds of digits
+            refuse("is out of bounds")
         if math.isnan(number):
             refuse("is not a number")
         if self.element is int:
@@ -297,10 +302,15 @@ class Parameters:
         return dataclasses.replace(self, **own)
 
 
-def fields_of(cls: type) -> list[tuple[dataclasses.Field, Any]]:
+def fields_of(cls: type) -> tuple[tuple[dataclasses.Field, Any], ...]:
     """(dataclass field, its annotation) of each field, in order."""
-    hints = typing.get_type_hints(cls)
-    return [(field, hints[field.name]) for field in dataclasses.fields(cls)]
+    if cls not in _FIELDS:
+        hints = typing.get_type_hints(cls)
+        _FIELDS[cls] = tuple((field, hints[field.name]) for field in dataclasses.fields(cls))
+    return _FIELDS[cls]
+
+
+_FIELDS: dict[type, tuple[tuple[dataclasses.Field, Any], ...]] = {}
 
 
 def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
@@ -308,6 +318,7 @@ def is_group(kind: Any) -> TypeGuard[type[Parameters]]:
     return isinstance(kind, type) and issubclass(kind, Parameters)
 
 
+@functools.cache
 def _info(field: dataclasses.Field, kind: Any) -> ParameterInfo:
     element, is_tuple, optional = split_type(kind)
     return ParameterInfo(name=field.name, kind=kind, element=element, is_tuple=is_tuple,

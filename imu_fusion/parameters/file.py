@@ -7,17 +7,8 @@ from typing import Any
 import yaml
 
 from imu_fusion.errors import ParameterError
+from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, flatten, unknown_parameter
-
-
-class _Loader(yaml.SafeLoader):
-    """Also reads lists as launch_ros writes them into the files that it makes: as tuples."""
-
-    def construct_tuple(self, node: yaml.SequenceNode) -> list[Any]:
-        return self.construct_sequence(node)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_tuple)
 
 
 def dump(node: str, values: dict[str, Any]) -> str:
@@ -40,12 +31,7 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
         ParameterError: not readable, not YAML, or not of that form.
     """
     path = Path(path)
-    try:
-        content = yaml.load(path.read_text(), _Loader)
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: is not YAML: {error}") from None
+    content = read_yaml(path)
     if content is None:
         return {}
     nodes: dict[str, dict[str, Any]] = {}
@@ -61,7 +47,11 @@ def _walk(path: Path, content: Any, prefix: str = "") -> Iterator[tuple[str, dic
     for key, body in content.items():
         if isinstance(body, dict) and "ros__parameters" in body:
             name = str(key).rstrip("/").rpartition("/")[2]
-            yield name, body["ros__parameters"] or {}
+            parameters = body["ros__parameters"] or {}
+            if not isinstance(parameters, dict):
+                raise ParameterError(f"{path}: 'ros__parameters' of '{prefix}{key}' must map names "
+                                     "to values")
+            yield name, parameters
         else:
             yield from _walk(path, body, f"{prefix}{key}/")
 

@@ -1,25 +1,23 @@
 """Writing recordings: rosbag2 directories with MCAP.
 
-Goes through ``mcap``, which stores CRCs and keeps log and publish time apart.
+Log and publish time are kept apart, chunks carry CRCs.
 """
 
 import contextlib
 import os
 import shutil
+import struct
 from collections import Counter
 from pathlib import Path
 
-import mcap.writer
 import yaml
 from rosbags.typesys.store import Typestore
 
 from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
+from imu_fusion.recordings.mcap_writer import McapWriter
 from imu_fusion.recordings.qos import qos_profile
-from imu_fusion.recordings.results import RESULTS_FILE
-
-# What we write into the directory of a recording beside its files.
-_BESIDE = ("metadata.yaml", RESULTS_FILE, "report.html")
+from imu_fusion.recordings.targets import LIBRARY, METADATA_FILE, why_not_replaced
 
 
 class _Dumper(yaml.SafeDumper):
@@ -33,13 +31,17 @@ class BagWriter:
     """Write a rosbag2 directory: ``<directory>/<name>_0.mcap`` and ``metadata.yaml``.
 
     A chunk is on its way to the disk as soon as it is complete, so that a crash
-    loses at most the open one.
+    loses at most the open one. With ``whole`` the recording appears at its place complete, by
+    renaming, or not at all: for what can be made again. What is replaced goes once the new one is
+    complete.
 
     Args:
-        directory: must not exist or be empty, unless ``overwrite``.
+        directory: must not exist or be empty, unless ``overwrite``. The attribute ``directory``
+            is where files are written now.
         compression: ``zstd``, ``lz4`` or ``none``.
         chunk_size: bytes of messages per chunk.
-        overwrite: replace what is there, if it is a recording.
+        overwrite: replace what is there, if it is a recording and nothing else.
+        whole: see above; leaving the context by an exception leaves everything as it was.
         typestore: source of message definitions; Jazzy's by default.
 
     Raises:
@@ -48,49 +50,86 @@ class BagWriter:
 
     def __init__(self, directory: str | Path, compression: str = "zstd",
                  chunk_size: int = 256 * 1024, overwrite: bool = False,
-                 typestore: Typestore = TYPES):
-        self.directory = Path(directory)
+                 typestore: Typestore = TYPES, whole: bool = False):
+        self._target = Path(directory).resolve()
+        self.directory = self._target
+        self._replaced: Path | None = None    # where what was there is kept until the end
+        self._whole = whole
         self.counts: Counter[str] = Counter()
         self._typestore = typestore
         self._channels: dict[str, int] = {}
         self._topics: dict[str, dict] = {}
-        self._first: int | None = None
-        self._last: int | None = None
-        self._sequence: Counter[str] = Counter()
         self._prepare(overwrite)
-        name = self.directory.resolve().name
-        self._file = f"{name}_0.mcap"
+        self._file = f"{self._target.name}_0.mcap"
         try:
             self._stream = open(self.directory / self._file, "wb")  # noqa: SIM115, closed by close
+            self._writer = McapWriter(self._stream, "ros2", LIBRARY, chunk_size, compression)
+            self._stream.flush()
         except OSError as error:
-            raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
-        self._position = 0
-        self._writer = mcap.writer.Writer(
-            self._stream, chunk_size=chunk_size,
-            compression=mcap.writer.CompressionType[compression.upper()])
-        self._writer.start(profile="ros2", library="imu_fusion")
-        self._flush()
+            self._restore()
+            raise BagError(f"{self._target}: cannot be written ({error.strerror})") from None
 
     def _prepare(self, overwrite):
+        target = self._target
         try:
-            if self.directory.exists():
-                if not self.directory.is_dir():
-                    raise BagError(f"{self.directory}: is a file, not a directory to record into")
-                present = sorted(p.name for p in self.directory.iterdir())
-                ours = all(p in _BESIDE or p.endswith((".mcap", ".db3")) for p in present)
-                if present and not (overwrite and ours):
-                    raise BagError(f"{self.directory}: exists and is not empty; choose another "
-                                   "directory" + ("" if ours else " (it holds other files)"))
-                shutil.rmtree(self.directory)
-            self.directory.mkdir(parents=True)
+            occupied = os.path.lexists(target)
+            if occupied and not target.is_dir():
+                raise BagError(f"{target}: is a file, not a directory to record into")
+            occupied = occupied and any(target.iterdir())
+            if occupied:
+                why = why_not_replaced(target)
+                if why or not overwrite:
+                    raise BagError(f"{target}: exists and is not empty; choose another directory"
+                                   + (f" ({why})" if why else ""))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if self._whole:
+                # Inside of an empty directory that is there: it may be a mount point.
+                inside = target.is_dir() and not occupied
+                self.directory = target / ".part" if inside else self._beside("part")
+                self.directory.mkdir()
+            else:
+                if occupied:
+                    self._put_aside()
+                target.mkdir(exist_ok=True)
         except OSError as error:
-            raise BagError(f"{self.directory}: cannot be written ({error.strerror})") from None
+            raise BagError(f"{target}: cannot be written ({error.strerror})") from None
+
+    def _beside(self, what):
+        return self._target.with_name(f".{self._target.name}.{what}-{os.getpid()}")
+
+    def _put_aside(self):
+        self._replaced = self._beside("replaced")
+        os.rename(self._target, self._replaced)
+
+    def _restore(self):
+        """Everything as it was before."""
+        with contextlib.suppress(OSError):
+            shutil.rmtree(self.directory)
+        if self._replaced is not None:
+            os.rename(self._replaced, self._target)
+
+    def _appear(self):
+        """Put the complete recording at its place; let go of what it replaces."""
+        if self.directory.parent == self._target:
+            for file in sorted(self.directory.iterdir(), key=lambda f: f.name == METADATA_FILE):
+                os.replace(file, self._target / file.name)
+            self.directory.rmdir()
+        elif self._whole:
+            if self._target.exists():
+                self._put_aside()
+            os.rename(self.directory, self._target)
+        self.directory = self._target
+        if self._replaced is not None:
+            shutil.rmtree(self._replaced)
 
     def __enter__(self) -> "BagWriter":
         return self
 
-    def __exit__(self, *_):
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_):
+        if kind is not None and self._whole:
+            self.abandon()
+        else:
+            self.close()
 
     def add_topic(self, topic: str, msgtype: str, qos: list[dict] | None = None,
                   definition: tuple[str, str] | None = None) -> None:
@@ -101,7 +140,7 @@ class BagWriter:
             definition: (ros2msg text, RIHS01 hash) of a type that Jazzy does not have.
         """
         if not topic.startswith("/"):
-            raise BagError(f"{self.directory}: topic '{topic}' must be absolute in a recording: "
+            raise BagError(f"{self._target}: topic '{topic}' must be absolute in a recording: "
                            f"'/{topic}'")
         qos = [qos_profile()] if qos is None else qos
         if definition is None:
@@ -110,8 +149,8 @@ class BagWriter:
             definition = (self._typestore.generate_msgdef(msgtype, ros_version=2)[0],
                           self._typestore.hash_rihs01(msgtype))
         text, digest = definition
-        schema = self._writer.register_schema(msgtype, "ros2msg", text.encode())
-        self._channels[topic] = self._writer.register_channel(
+        schema = self._writer.add_schema(msgtype, "ros2msg", text.encode())
+        self._channels[topic] = self._writer.add_channel(
             topic, "cdr", schema, {"offered_qos_profiles": yaml.dump(qos, Dumper=_Dumper),
                                    "topic_type_hash": digest})
         self._topics[topic] = {"name": topic, "type": msgtype, "serialization_format": "cdr",
@@ -135,27 +174,19 @@ class BagWriter:
         if topic not in self._channels:
             self.add_topic(topic, msgtype, qos, definition)
         elif self._topics[topic]["type"] != msgtype:
-            raise BagError(f"{self.directory}: topic {topic} is {self._topics[topic]['type']}, "
+            raise BagError(f"{self._target}: topic {topic} is {self._topics[topic]['type']}, "
                            f"not {msgtype}")
         try:
-            self._writer.add_message(self._channels[topic], log_time, bytes(cdr),
+            self._writer.add_message(self._channels[topic], self.counts[topic], log_time,
                                      log_time if publish_time is None else publish_time,
-                                     self._sequence[topic])
-            self._flush()
+                                     bytes(cdr))
         except OSError as error:
-            raise BagError(f"{self.directory}: writing failed ({error.strerror}); what was "
-                           "written before stays readable") from error
-        self._sequence[topic] += 1
+            raise BagError(f"{self._target}: writing failed ({error.strerror}); "
+                           + self._what_stays()) from error
+        except struct.error as error:
+            raise BagError(f"{self._target}: topic {topic}: a message at {log_time} ns cannot be "
+                           f"recorded: MCAP counts from 1970 on ({error})") from None
         self.counts[topic] += 1
-        self._first = log_time if self._first is None else min(self._first, log_time)
-        self._last = log_time if self._last is None else max(self._last, log_time)
-
-    def _flush(self):
-        # tell() moves only when the mcap writer has completed a chunk.
-        position = self._stream.tell()
-        if position != self._position:
-            self._stream.flush()
-            self._position = position
 
     def close(self) -> None:
         """Write index and metadata; safe to call twice.
@@ -165,31 +196,40 @@ class BagWriter:
         """
         if self._stream.closed:
             return
-        information = self._information()
         try:
+            self._writer.end_chunk()
+            information = self._information()
             # As rosbag2 does: the file alone tells what the directory would.
-            self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.dump(
+            self._writer.finish("rosbag2", {"serialized_metadata": yaml.dump(
                 information, Dumper=_Dumper, sort_keys=False)})
-            self._writer.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
             self._write_metadata(information)
+            self._stream.close()
+            self._appear()
         except OSError as error:
-            raise BagError(f"{self.directory}: closing failed ({error.strerror}); complete "
-                           "chunks stay readable") from error
-        finally:
-            with contextlib.suppress(OSError):  # reported above
-                self._stream.close()
+            self.abandon()
+            raise BagError(f"{self._target}: closing failed ({error.strerror}); "
+                           + self._what_stays()) from error
 
     def abandon(self) -> None:
-        """Close the file as it is, after an error: no index, chunks stay readable."""
+        """After an error. A ``whole`` recording vanishes, and what was there before stays. Of
+        another one the file stays as it is, without index, its chunks readable."""
         with contextlib.suppress(OSError):
             self._stream.close()
+        if self._whole and self.directory != self._target:
+            self._restore()
+
+    def _what_stays(self):
+        if self._whole:
+            return "nothing was written"
+        kept = f", and what it replaces at {self._replaced}" if self._replaced else ""
+        return "what was written before stays readable" + kept
 
     def _information(self):
         """What rosbag2 calls the bag's metadata."""
-        first = 0 if self._first is None else self._first
-        duration = 0 if self._last is None else self._last - first
+        first = self._writer.start_time or 0
+        duration = (self._writer.end_time or 0) - first
         total = sum(self.counts.values())
         times = {"starting_time": {"nanoseconds_since_epoch": first},
                  "duration": {"nanoseconds": duration}, "message_count": total}
@@ -205,7 +245,7 @@ class BagWriter:
 
     def _write_metadata(self, information):
         # Under another name first: a metadata.yaml that exists is complete.
-        temporary = self.directory / "metadata.yaml.part"
+        temporary = self.directory / f"{METADATA_FILE}.part"
         temporary.write_text(yaml.dump({"rosbag2_bagfile_information": information},
                                        Dumper=_Dumper, sort_keys=False))
-        os.replace(temporary, self.directory / "metadata.yaml")
+        os.replace(temporary, self.directory / METADATA_FILE)

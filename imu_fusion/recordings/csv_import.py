@@ -17,6 +17,7 @@ The result is a recording and a parameter file of the acceleration field estimat
 """
 
 import csv
+import os
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -29,8 +30,10 @@ from imu_fusion.errors import BagError, ParameterError, SampleError
 from imu_fusion.estimation.acceleration_field.params import AccelerometerParams, Sensor
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
+from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.targets import refuse_files, refuse_source
 from imu_fusion.streams.acceleration_field import (
     GYROSCOPE_TOPIC,
     NODE,
@@ -127,6 +130,9 @@ def import_csv(source: str | Path, description: str | Path, out: str | Path,
     """
     out = Path(out)
     parameter_file = out.with_name(out.name + ".yaml")
+    refuse_source(source, out)
+    refuse_source(description, out)
+    refuse_files([source, description], parameter_file)
     if parameter_file.exists() and not overwrite:
         raise BagError(f"{parameter_file}: exists already; choose another name or --overwrite")
     table_params, sensors, given = _read_description(description)
@@ -138,25 +144,24 @@ def import_csv(source: str | Path, description: str | Path, out: str | Path,
     rows = [(stamp, topic_rank, sensor.topic, cdr) for topic_rank, sensor in enumerate(sensors)
             for stamp, cdr in sensor.messages(stamps, table, config.stream.body_frame)]
     rows.sort(key=lambda row: row[:2])
-    with BagWriter(out, overwrite=overwrite) as writer:
-        for stamp, _, topic, cdr in rows:
-            writer.write("/" + topic, IMU.msgtype, cdr, stamp)
-    try:
-        parameter_file.write_text(
-            f"# Made from {Path(source).name} as {Path(description).name} says.\n"
+    text = (f"# Made from {Path(source).name} as {Path(description).name} says.\n"
             + yaml.dump({NODE: {"ros__parameters": values}}, Dumper=_Dumper, sort_keys=False,
                         default_flow_style=None, width=100))
-    except OSError as error:
-        raise BagError(f"{parameter_file}: cannot be written ({error.strerror})") from None
+    with BagWriter(out, overwrite=overwrite, whole=True) as writer:
+        for stamp, _, topic, cdr in rows:
+            writer.write("/" + topic, IMU.msgtype, cdr, stamp)
+        beside = parameter_file.with_name(f".{parameter_file.name}.part")
+        try:
+            beside.write_text(text)
+        except OSError as error:
+            raise BagError(f"{parameter_file}: cannot be written ({error.strerror})") from None
+    os.replace(beside, parameter_file)
     return parameter_file, len(stamps)
 
 
 def _read_description(path):
     """(TableParams, list of _Sensor, dict of the other parameters) of a description."""
-    try:
-        content = yaml.safe_load(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ParameterError(f"{path}: not a readable YAML description: {error}") from None
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: must map names to values; see the documentation of convert")
     arrays, gyroscope, given = (_mapping(content.pop(key, None), key, path)

@@ -26,6 +26,7 @@ from imu_fusion.messages.convert import fix_message, imu_message, mag_message, v
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, TWIST
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.csv_import import read_number
+from imu_fusion.recordings.targets import refuse_source
 
 Messages = Iterator[tuple[str, str, int, bytes]]    # topic, msgtype, stamp in ns, CDR
 Importer = Callable[[Path], Messages]
@@ -77,8 +78,9 @@ def import_files(importer: Importer, source: str | Path, out: str | Path,
         SampleError: names the file and the line, column or unit that is wrong.
         BagError: ``out`` is in the way or cannot be written.
     """
+    refuse_source(source, out)
     rows = sorted(importer(Path(source)), key=lambda row: row[2])
-    with BagWriter(out, overwrite=overwrite) as writer:
+    with BagWriter(out, overwrite=overwrite, whole=True) as writer:
         for topic, msgtype, stamp, cdr in rows:
             writer.write(topic, msgtype, cdr, stamp)
     return dict(writer.counts)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.targets import refuse_source
 
 
 def repair(path: str | Path, directory: str | Path) -> dict[str, int]:
@@ -12,7 +13,9 @@ def repair(path: str | Path, directory: str | Path) -> dict[str, int]:
     Returns:
         dict of topic to number of messages.
     """
-    with open_bag(path) as reader, BagWriter(directory, typestore=reader.typestore) as writer:
+    refuse_source(path, directory)
+    with open_bag(path) as reader, BagWriter(directory, typestore=reader.typestore,
+                                             whole=True) as writer:
         for topic, msgtype, log_time, cdr in reader.messages():
             writer.write(topic, msgtype, cdr, log_time, qos=reader.topics[topic].qos_profiles)
         return dict(writer.counts)

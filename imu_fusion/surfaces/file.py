@@ -11,10 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from imu_fusion.errors import ImuFusionError, LayoutError
+from imu_fusion.errors import ImuFusionError, LayoutError, ParameterError
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.surfaces.constraint import DEFAULT_SIGMA, Surface
 from imu_fusion.surfaces.elevation_grid import ElevationGrid
 from imu_fusion.surfaces.fis_hill import FisHill
@@ -153,10 +152,10 @@ def load_surface(name: str | Path) -> Surface:
         where = "" if path.is_absolute() else f" in {Path.cwd()} or beside the parameter file"
         raise LayoutError(f"surface file {path} does not exist{where}")
     try:
-        mapping = yaml.safe_load(path.read_bytes())
-    # ValueError: a date that is none; RecursionError: brackets nested a thousandfold.
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise LayoutError(f"surface file {path} cannot be read as YAML: {error}") from error
+        mapping = read_yaml(path)
+    except ParameterError as error:
+        why = str(error).removeprefix(f"{path}: ")
+        raise LayoutError(f"surface file {path} cannot be read as YAML: {why}") from error
     if not isinstance(mapping, dict):
         raise LayoutError(f"surface file {path} holds no mapping of keys to values")
     try:

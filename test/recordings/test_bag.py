@@ -231,6 +231,7 @@ def test_writer_refuses_what_is_in_its_way(tmp_path):
     with pytest.raises(BagError, match="other files"):
         BagWriter(tmp_path / "bag", overwrite=True)
     assert (tmp_path / "bag" / "thesis.txt").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["bag"]
     with pytest.raises(BagError, match="cannot be written"):
         BagWriter("/proc/imu_fusion/bag")
     with BagWriter(tmp_path / "other") as writer:
