@@ -38,8 +38,9 @@ def recording(seed, inclination_deg, rate=100.0, duration=30.0):
     return imu, mag, truth, declination
 
 
-def as_stated(seed, rate=100.0, duration=30.0):
-    """A recording whose every error is drawn from what OrientationParams' defaults state."""
+def as_stated(seed, local_field_sd, rate=100.0, duration=30.0):
+    """A recording whose every error is drawn from what OrientationParams' defaults state, under
+    one of their hypotheses of the local field."""
     params, norm, dt = OrientationParams(), 48e-6, 1.0 / rate
     p, f = params.sensor, params.fusion
     rng = np.random.default_rng(seed)
@@ -59,9 +60,11 @@ def as_stated(seed, rate=100.0, duration=30.0):
     # mag_disturbance_sd is that of a mean over 20 ms.
     disturbance = f.mag_disturbance_sd * math.sqrt(0.02 / dt) * rng.normal(size=mag.mag.shape)
     keep = math.exp(-dt / f.local_field_time)
-    local = f.local_field_sd * rng.normal(size=3)
-    for row in disturbance:
-        local = keep * local + f.local_field_sd * math.sqrt(1 - keep ** 2) * rng.normal(size=3)
+    local = local_field_sd * rng.normal(size=3)
+    for t, row in zip(mag.stamp * 1e-9, disturbance):
+        if t > motion.rest:    # one place, as long as it rests
+            local = (keep * local
+                     + local_field_sd * math.sqrt(1 - keep ** 2) * rng.normal(size=3))
         row += local
     turn = Rotation.from_quat(motion.truth(mag.stamp * 1e-9)[0])
     disturbed = MagLog(mag.stamp, mag.mag + norm * turn.inv().apply(disturbance))
@@ -72,8 +75,9 @@ def main():
     rows = []
     cases = [(f"clean magnetometer, inclination {i} deg", "field",
               lambda seed, i=i: recording(seed, i)) for i in (65, 0, -60)]
-    cases += [(f"errors as the defaults state, heading_anchor {anchor}", anchor, as_stated)
-              for anchor in ("field", "rest")]
+    cases += [(f"errors as the defaults state, local field {sd}, heading_anchor {anchor}", anchor,
+               lambda seed, sd=sd: as_stated(seed, sd))
+              for sd in OrientationParams().fusion.local_field_sd for anchor in ("field", "rest")]
     for name, anchor, draw in cases:
         for mode in ("causal", "smoothed"):
             distance, error = [], []

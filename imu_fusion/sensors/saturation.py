@@ -21,8 +21,9 @@ from imu_fusion.kernels import njit
 
 # The two ends of a range differ by a step (-32768, +32767), of 14 bits at the coarsest.
 LIMIT_TOLERANCE = 1.5e-4
-# Of the limit: what misalignment, scale and bias of a calibration leave of a flat top's flatness.
+# Of the limit: what misalignment, scale and bias of a calibration leave of a flat top's flatness,
 BAND = 0.01
+_SPREAD = 2.0 * BAND       # and what flat tops at other rates of the other axes differ by
 _REPEATS_AT_LIMIT = 4      # equal largest values in a row that make a flat top
 # A flat top is run into by a step of more than this share of its size. A smooth peak that repeats
 # four times was reached by about one step of quantisation: 5e-4 of full scale for 12 bits.
@@ -106,7 +107,7 @@ def _look_at(found, i, value, floor):
     found.largest[i] = max(found.largest[i], lasting)
     if lasting > found.limit[i] * (1.0 + found.tolerance[i]):
         found.limit[i] = math.inf    # a value that lasted and was no limit
-    if lasting > found.level[i] * (1.0 + BAND):
+    if lasting > found.level[i] * (1.0 + _SPREAD):
         found.level[i] = 0.0
     high, low = max(found.high[i], size), min(found.low[i], size)
     if value * found.last[i] > 0.0 and high - low <= BAND * high:
@@ -126,14 +127,14 @@ def _judge_run(found, i, edge, floor):
     at one level proves the limit."""
     level = 0.5 * (found.low[i] + found.high[i])
     if (found.counted[i] or found.count[i] < _RUN or level < 2.0 * floor
-            or found.high[i] < found.largest[i] * (1.0 - BAND)
+            or found.high[i] < found.largest[i] * (1.0 - _SPREAD)
             or (found.count[i] - 1) * edge < _STEEP * BAND * level):
         return
     found.counted[i] = 1
-    if found.level[i] > 0.0 and abs(level - found.level[i]) < BAND * level < math.inf:
-        if found.limit[i] == math.inf:
-            found.limit[i] = max(level, found.level[i])
-            found.tolerance[i] = BAND
+    if (found.limit[i] == math.inf and found.level[i] > 0.0
+            and abs(level - found.level[i]) < BAND * level):
+        found.limit[i] = max(level, found.level[i])
+        found.tolerance[i] = _SPREAD
     found.level[i] = level
 
 

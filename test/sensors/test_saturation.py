@@ -1,10 +1,19 @@
-"""Recovery of clipped rates (Winkler 2025, appendix B) on exact simulated motion."""
+"""Ranges found from flat tops, and recovery of clipped rates (Winkler 2025, appendix B), on exact
+simulated motion."""
 
 import numpy as np
 import pytest
 
 from imu_fusion.errors import SampleError
-from imu_fusion.sensors.saturation import recover_rates, saturated_axes
+from imu_fusion.kernels import njit
+from imu_fusion.sensors.saturation import (
+    BAND,
+    FLAT_TOPS,
+    find_flat_tops,
+    recover_rates,
+    saturated_axes,
+    start_flat_tops,
+)
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 
 
@@ -44,3 +53,68 @@ def test_shapes_are_checked(clipped):
     imu, mag, _ = clipped
     with pytest.raises(SampleError, match="recover_rates"):
         recover_rates(imu.stamp, imu.gyr, mag.mag[:-1], 6.0)
+
+
+@njit
+def _search(found, ranges, values, marked):
+    start_flat_tops(found[0], ranges)
+    for i in range(len(values)):
+        marked[i] = find_flat_tops(found[0], ranges, 1.0, values[i])
+
+
+def search(values, ranges=(np.nan, np.nan, np.nan)):
+    """FLAT_TOPS after values (n, 3), and the bits of the axes at their limit (n,)."""
+    found, marked = np.zeros(1, FLAT_TOPS), np.zeros(len(values), dtype=np.int64)
+    _search(found, np.array(ranges), np.ascontiguousarray(values), marked)
+    return found[0], marked
+
+
+def rates(seed, rate_sd=5.0, rate=200.0):
+    return simulate(Tumbling(seed=seed, rate_sd=rate_sd), 30.0, rate=rate)[3]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("limit", [4.0, 8.0])
+def test_tops_behind_a_calibration_are_flat_though_not_equal(seed, limit):
+    rng = np.random.default_rng(seed)
+    true = rates(seed)
+    matrix = np.eye(3) + rng.normal(0, 0.003, (3, 3))
+    bias = rng.normal(0, 0.01, 3)
+    values = (np.clip(true, -limit, limit) - bias) @ matrix.T + rng.normal(0, 3e-3, true.shape)
+    found, marked = search(values)
+    clipped = np.abs(true) > limit
+    for i in range(3):
+        if clipped[:, i].sum() < 50:
+            continue
+        assert found["limit"][i] == pytest.approx(limit, rel=2.5 * BAND)
+        bits = (marked >> i) & 1 == 1
+        # What comes before the second flat top is not known.
+        later = np.flatnonzero(bits)[0]
+        assert bits[later:][clipped[later:, i]].mean() > 0.95
+        assert np.abs(true[bits, i]).min() > limit * (1 - 4 * BAND)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("rate", [40.0, 100.0, 300.0])
+def test_smooth_motion_has_no_flat_tops(seed, rate):
+    rng = np.random.default_rng(seed)
+    true = rates(seed, rate_sd=rng.uniform(1, 8), rate=rate)
+    for noise in (0.0, 5e-3):
+        found, marked = search(true + rng.normal(0, noise, true.shape))
+        assert np.isinf(found["limit"]).all() and not marked.any()
+
+
+def test_a_spike_or_a_pause_is_no_limit():
+    true = rates(1)
+    true[50:3000:100] = 30.0
+    assert np.isinf(search(true)[0]["limit"]).all()
+    # Turning at one rate for a while, then faster: what was no limit is given up.
+    steps = np.repeat([[0.0], [3.0], [0.5], [3.0], [0.5], [5.0], [0.0]], 40, axis=0) * np.ones(3)
+    steps += np.random.default_rng(0).normal(0, 1e-3, steps.shape)
+    found, marked = search(steps)
+    assert np.isinf(found["limit"]).all() and not marked[-79:].any()
+
+
+def test_a_range_of_the_data_sheet_is_met_within_a_calibration():
+    values = np.array([[5.96, -5.95, 5.9]])
+    assert search(values, (6.0, 6.0, 6.0))[1][0] == 3

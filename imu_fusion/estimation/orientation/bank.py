@@ -29,6 +29,8 @@ from imu_fusion.kernels import njit
 # filter, while what moves the innovations lasts as long as the local field does, 0.3 s. The log
 # likelihood counts them once.
 _REPEATS = 15.0
+# Before there is a sample: near iron is the exception, and a rest tells nothing of it.
+_LOG_PRIOR = math.log(0.05)    # of each hypothesis beside the first
 _NEGLIGIBLE = 1e-6         # weight of a hypothesis that changes nothing any more
 _NO_TAPE = np.empty(0, es.TAPE)
 
@@ -67,16 +69,15 @@ def part(state):
 def weights(state):
     """Weights (k,) of the hypotheses by what was measured so far; the sum is 1, those that are
     negligible, or still one with the first, are 0."""
-    out = np.zeros(len(state))
-    largest = -math.inf
+    out = np.full(len(state), -math.inf)
     for k in range(len(state)):
         if state[k].stamp == state[0].stamp:
-            largest = max(largest, state[k].log_likelihood)
+            out[k] = state[k].log_likelihood / _REPEATS + (_LOG_PRIOR if k > 0 else 0.0)
+    largest = out.max()
     total = 0.0
     for k in range(len(state)):
-        if state[k].stamp == state[0].stamp:
-            weight = math.exp((state[k].log_likelihood - largest) / _REPEATS)
-            out[k] = weight if weight > _NEGLIGIBLE else 0.0
+        weight = math.exp(out[k] - largest)
+        out[k] = weight if weight > _NEGLIGIBLE else 0.0
         total += out[k]
     return out / total
 
@@ -156,7 +157,8 @@ def _mix_bias(rows, weight, row):
             force += weight[k] * rows[k].acc[i]
         variance = var_rate = var_force = 0.0
         for k in range(len(rows)):
-            variance += weight[k] * (rows[k].gyr_bias_sd[i] ** 2 + (rows[k].gyr_bias[i] - bias) ** 2)
+            off = rows[k].gyr_bias[i] - bias
+            variance += weight[k] * (rows[k].gyr_bias_sd[i] ** 2 + off * off)
             var_rate += weight[k] * (rows[k].cov_gyr[i, i] + (rows[k].gyr[i] - rate) ** 2)
             var_force += weight[k] * (rows[k].cov_acc[i, i] + (rows[k].acc[i] - force) ** 2)
         row.gyr_bias[i], row.gyr[i], row.acc[i] = bias, rate, force

@@ -209,7 +209,8 @@ class OrientationEstimator:
         anew, at the yaw of before if nothing tells another."""
         rows = self.finish()
         if self._alignment is not None:
-            self._yaw = quat_to_rpy(self._likeliest()["quat_world_imu"])[2]
+            likeliest = self._state[bank.likeliest(bank.weights(self._state))]
+            self._yaw = quat_to_rpy(likeliest["quat_world_imu"])[2]
         corrected = self.take_corrected()
         self._counted = self._counts()
         self._counted["gaps"] += 1
@@ -248,8 +249,13 @@ class OrientationEstimator:
         return int(self._state["counts"]["mag_saturated"][0] + self._counted["mag_saturated"][0])
 
     def summary(self) -> dict[str, Any]:
-        """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla)."""
-        s, par, a = self._likeliest(), self._par[0], self._alignment
+        """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla).
+
+        Of the hypotheses it is the likelier: ``local_field_sd``, with its weight.
+        """
+        weight = bank.weights(self._state)
+        best = bank.likeliest(weight)
+        s, par, a = self._state[best], self._par[0], self._alignment
         counts = dict(
             method=self.params.method, aligned=a is not None,
             **{name: int(value) for name, value in zip(COUNT_NAMES, self._counts()[0])})
@@ -260,15 +266,13 @@ class OrientationEstimator:
             **{f"initial_quat_{c}": float(v) for c, v in zip("xyzw", a.quat_world_imu)},
             initial_tilt_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[0, 0])),
             initial_heading_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[2, 2])),
+            local_field_sd=float(self._par[best]["local_field_sd"]),
+            local_field_weight=float(weight[best]),
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
             **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", s["gyro_bias"])},
             gyro_delay=float(par["gyro_delay"]),
             mag_delay=float(par["gyro_delay"] + s["mag_lag"]))
-
-    def _likeliest(self):
-        """State of the likeliest hypothesis."""
-        return self._state[bank.likeliest(bank.weights(self._state))]
 
     def _counts(self):
         """Counts of the present stretch and of those before it, (1,) COUNTS."""

@@ -269,8 +269,13 @@ def _end_block(s, p, tape):
     # A plain array: the algebra is compiled once for all that it is used on.
     es.predict(s.cov[:], s.block)
     error = np.zeros(es.N)
+    known = s.log_likelihood
     correct(s, p, error, tape)
+    if s.clipped or s.was_clipped:
+        # What a clipped rate was is a guess: its misfit is no evidence of the surroundings.
+        s.log_likelihood = known
     _add_error(s, p, error)
+    magnetometer.judge_anchor(s, p)
     if len(tape):
         for i in range(es.N):
             source, target = s.cov[i], tape[0].cov[i]    # row by row: as fast as memory

@@ -11,7 +11,6 @@ import numpy as np
 
 from imu_fusion.estimation.orientation import bank, fusion, gyro_limit, gyro_mag, mag_queue
 from imu_fusion.estimation.orientation.alignment import Alignment
-from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.estimation.orientation.state import new_state

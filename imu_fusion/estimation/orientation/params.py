@@ -121,7 +121,7 @@ class FusionParams(Parameters):
         doc="Whether gyroscope bias and scale are estimated; false holds them. Switch it off while "
             "a motion is known to mislead it.")
     velocity_walk: float = param(
-        0.1, unit="m/s^2/sqrt(Hz)", low=0,
+        0.14, unit="m/s^2/sqrt(Hz)", low=0,
         doc="What the specific force does not tell of the motion. Raise it for vibration and "
             "impacts: gravity is then averaged over a longer time.")
     velocity_sd: float = param(
@@ -295,9 +295,10 @@ def kernel_parameters(params: OrientationParams) -> np.ndarray:
     """Parameters as the kernels read them: a structured array, an element for each hypothesis.
 
     Beside the parameters under their names it has, at the top level, what follows from them:
-    local_field_sd of the hypothesis, gyro_delay, gyro_delay_sd, mag_delay_sd (s; zero where a delay is taken as known), declination,
-    heading_sd (rad), frame_from_enu (4,), use_acc and rest_force (m/s^2; with gyro_mag neither
-    the filter nor its rest detector looks at the accelerometer), follows_field, as_printed.
+    local_field_sd of the hypothesis, gyro_delay, gyro_delay_sd, mag_delay_sd (s; zero where a
+    delay is taken as known), declination, heading_sd (rad), frame_from_enu (4,), use_acc and
+    rest_force (m/s^2; with gyro_mag neither the filter nor its rest detector looks at the
+    accelerometer), follows_field, as_printed.
     """
     hypotheses = params.fusion.local_field_sd if params.method == "fusion" else (
         params.fusion.local_field_sd[:1])

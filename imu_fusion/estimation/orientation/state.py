@@ -1,9 +1,9 @@
 """What the kernels remember: every number by name, shape, unit and meaning.
 
 One state for both methods, a structured array of one element per hypothesis (bank): a kernel takes
-it as ``state``, works on ``s = state[k]``, and a snapshot is one copy. Parts that belong to one module are
-records of their own. Rates are rad/s in imu axes, specific forces m/s^2, stamps int64 ns;
-``raw`` is as the sensor reports it.
+it as ``state``, works on ``s = state[k]``, and a snapshot is one copy. Parts that belong to one
+module are records of their own. Rates are rad/s in imu axes, specific forces m/s^2, stamps int64
+ns; ``raw`` is as the sensor reports it.
 """
 
 import numpy as np
@@ -152,6 +152,8 @@ STATE = np.dtype([
     ("field_norm", "f8"),                # T; 0 before the first sample
     ("gravity", "f8"),                   # m/s^2
     ("log_likelihood", "f8"),            # of all measurements so far, less a constant
+    ("is_anchored", "?"),                # whether the heading is that of the first needle
+    ("anchor", "f8", 12),                # rad, of that per hard (3) and soft iron (9)
     ("heading_var", "f8"),               # rad^2, of a heading that no filter can improve on
     # The block being collected.
     ("block", PREDICTION),

@@ -28,6 +28,7 @@ _WHITE_TIME = 0.02         # s: faster sampling of the same disturbance is no ne
 _TAIL_DOF = 5.0
 # Columns: attitude (2), field, local field, lag, offset (3), matrix (9).
 _LAG, _OFFSET, _MATRIX, _COLUMNS = 4, 5, 8, 17
+_IRON = 12                 # states of hard and soft iron
 
 
 @njit
@@ -49,12 +50,11 @@ def start_field(s, p, z, has_heading, follow):
         cov[i, i] = 1.0 if i < es.LOCAL_FIELD else p.local_field_sd ** 2
     if has_heading:
         cov[es.ATTITUDE + 2, es.ATTITUDE + 2] += follow
-        # What is left of hard and soft iron turns the needle and stays in the heading.
-        iron = ((p.fusion.mag_offset_sd ** 2 + p.fusion.mag_matrix_sd ** 2)
-                / max(b[0] ** 2 + b[1] ** 2, 1e-4))
-        s.heading_var = min(p.heading_sd ** 2 + iron, es.UNIFORM_VARIANCE) * (1.0 - follow)
         s.heading_known = True
+        s.is_anchored = follow == 0.0
+        s.heading_var = 0.0
     _share_errors(s, p, b, has_heading, follow)
+    judge_anchor(s, p)
 
 
 @njit
@@ -66,6 +66,12 @@ def _share_errors(s, p, b, has_heading, follow):
     error = np.zeros(es.N)
     no_tape = np.empty(0, es.TAPE)
     row.residual, row.variance = 0.0, _FIRST_FIELD_SD ** 2
+    for c in range(3):
+        # What iron turns the needle by: across the field and horizontal.
+        s.anchor[c] = ((b[0] * r[1, c] - b[1] * r[0, c])
+                       / max(b[0] ** 2 + b[1] ** 2, _HORIZONTAL_SHARE ** 2))
+        for d in range(3):
+            s.anchor[3 + 3 * c + d] = s.anchor[c] * m[d]
     for i in range(3):
         _put_columns(row, i, b)
         row.coefficient[_LAG] = 0.0
@@ -81,6 +87,41 @@ def _share_errors(s, p, b, has_heading, follow):
         row.index[0], row.index[1] = es.FIELD, es.FIELD + 1
         row.coefficient[0], row.coefficient[1] = math.cos(p.declination), -math.sin(p.declination)
         es.update(s.cov, error, es.N, row, no_tape)
+
+
+@njit
+def judge_anchor(s, p):
+    """Variance of an anchored heading, which no later sample changes.
+
+    Beside its own it has what the local field and hard and soft iron turned the first needle by,
+    iron so far as it is known by now: what it is found to be, and what that leaves open. The
+    filter takes the first needle for true, hence iron for zero in that one pose, and of each state
+    keeps only what that leaves open. That much of its variance is no knowledge: it counts as the
+    prior until turning has made it smaller.
+    """
+    if not s.is_anchored:
+        return
+    hard, soft = p.fusion.mag_offset_sd ** 2, p.fusion.mag_matrix_sd ** 2
+    one_pose = hard * soft / (hard + soft) if hard + soft > 0.0 else 0.0
+    turned = 0.0
+    variance = 0.0
+    for a in range(_IRON):
+        i = _iron_index(a)
+        turned += s.anchor[a] * (s.mag_offset[a] if a < 3 else
+                                 s.mag_matrix[(a - 3) // 3, (a - 3) % 3])
+        open_part = min(s.cov[i, i] / one_pose, 1.0) if one_pose > 0.0 else 1.0
+        variance += s.anchor[a] ** 2 * open_part * (hard if a < 3 else soft)
+    # The place turned the needle, too: by more than heading_sd allows where it is near iron.
+    usual = p.fusion.local_field_sd[0]
+    place = max(p.local_field_sd ** 2 - usual ** 2, 0.0) * (
+        s.anchor[0] ** 2 + s.anchor[1] ** 2 + s.anchor[2] ** 2)
+    s.heading_var = min(p.heading_sd ** 2 + place + turned ** 2 + variance, es.UNIFORM_VARIANCE)
+
+
+@njit
+def _iron_index(a):
+    """Of hard (3) and soft iron (9), in the error state."""
+    return es.MAG_OFFSET + a if a < 3 else es.MAG_MATRIX + a - 3
 
 
 @njit

@@ -1,0 +1,103 @@
+"""Hypotheses of the local field: which one the samples choose, and what comes out of several."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import ParameterError
+from imu_fusion.estimation.orientation import bank
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+from imu_fusion.samples.logs import MagLog
+from imu_fusion.simulation.rotation import Tumbling, earth_field, simulate
+from test.estimation.orientation.test_estimator import NOISY, feed, make
+from test.estimation.orientation.test_fusion import rmse_deg
+
+
+def recording(local_sd, seed=4, duration=30.0):
+    """A recording in a field that differs by ``local_sd`` of its norm from place to place."""
+    motion = Tumbling(seed=seed)
+    imu, mag, truth, _ = simulate(motion, duration, rate=100.0, sensors=NOISY, seed=seed)
+    norm, rng = np.linalg.norm(earth_field()), np.random.default_rng(seed)
+    local, keep, rows = local_sd * rng.normal(size=3), math.exp(-0.01 / 0.3), []
+    for t in mag.stamp * 1e-9:
+        if t > motion.rest:    # one place, as long as it rests
+            local = keep * local + local_sd * math.sqrt(1 - keep ** 2) * rng.normal(size=3)
+        rows.append(local)
+    turn = Rotation.from_quat(motion.truth(mag.stamp * 1e-9)[0])
+    return imu, MagLog(mag.stamp, mag.mag + norm * turn.inv().apply(rows)), truth
+
+
+@pytest.fixture(scope="module")
+def beside_iron():
+    return recording(0.15)
+
+
+def test_the_samples_choose_the_hypothesis():
+    for local_sd, expected in ((0.003, 0.01), (0.15, 0.1)):
+        estimator = OrientationEstimator()
+        estimator.run(*recording(local_sd)[:2])
+        summary = estimator.summary()
+        assert summary["local_field_sd"] == expected
+        assert summary["local_field_weight"] > 0.99
+
+
+def test_both_hypotheses_are_no_worse_than_the_better_one(beside_iron):
+    imu, mag, truth = beside_iron
+    for mode in ("causal", "smoothed"):
+        one, other, both = (rmse_deg(make({"mode": mode, "fusion.local_field_sd": values}).run(
+            imu, mag), truth) for values in (0.01, 0.1, (0.01, 0.1)))
+        assert both < 1.1 * min(one, other), mode
+
+
+def test_sample_by_sample_and_from_a_snapshot_it_is_the_same(beside_iron):
+    imu, mag, _ = beside_iron
+    whole = OrientationEstimator().run(imu, mag)
+    assert feed(OrientationEstimator(), imu, mag).tobytes() == whole.tobytes()
+    first, k = OrientationEstimator(), 1237
+    j = int(np.searchsorted(mag.stamp, imu.stamp[k - 1], side="right"))
+    rows = first.run(imu[:k], mag[:j])
+    second = OrientationEstimator()
+    second.set_state(first.get_state())
+    assert np.concatenate([rows, second.run(imu[k:], mag[j:])]).tobytes() == whole.tobytes()
+
+
+def test_without_a_magnetometer_hypotheses_are_one_and_part_when_it_comes(beside_iron):
+    imu, mag, _ = beside_iron
+    alone = make({"fusion.local_field_sd": 0.01}).run(imu)
+    assert OrientationEstimator().run(imu).tobytes() == alone.tobytes()
+    late = mag[1000:]
+    rows = OrientationEstimator().run(imu, late)
+    before = imu.stamp < late.stamp[0]
+    assert rows[before].tobytes() == alone[before].tobytes()
+    assert feed(OrientationEstimator(), imu, late).tobytes() == rows.tobytes()
+    smoothed = make({"mode": "smoothed"}).run(imu, late)
+    assert len(smoothed) == len(imu) and np.isfinite(smoothed["quat_world_imu"]).all()
+
+
+def test_a_mixture_has_mean_and_covariance_of_both():
+    rng = np.random.default_rng(2)
+    rows = np.zeros(2, ORIENTATION_DTYPE)
+    base, apart = Rotation.random(random_state=rng), np.array([0.0, 0.02, 0.0])
+    weight = np.array([0.25, 0.75])
+    for row, turn in zip(rows, (0.0, 1.0)):
+        row["quat_world_imu"] = (base * Rotation.from_rotvec(turn * apart)).as_quat()
+        row["cov_attitude"] = np.diag([1e-4, 4e-4, 9e-4])
+        row["gyr_bias"], row["gyr_bias_sd"] = 0.01 * turn, 1e-3
+    mixed = np.zeros(1, ORIENTATION_DTYPE)
+    bank.mix_all(rows[:, None], weight, mixed)
+    found = (base.inv() * Rotation.from_quat(mixed["quat_world_imu"][0])).as_rotvec()
+    assert found == pytest.approx(0.75 * apart, abs=1e-9)
+    spread = 0.25 * 0.75 * np.outer(apart, apart)
+    assert mixed["cov_attitude"][0] == pytest.approx(
+        np.diag([1e-4, 4e-4, 9e-4]) + spread, abs=2e-7)
+    assert mixed["gyr_bias"][0] == pytest.approx([0.0075] * 3)
+    assert mixed["gyr_bias_sd"][0] ** 2 == pytest.approx([1e-6 + 0.25 * 0.75 * 1e-4] * 3)
+
+
+def test_the_number_of_hypotheses_cannot_change_while_running():
+    with pytest.raises(ParameterError, match="local_field_sd"):
+        OrientationEstimator().set_params(
+            OrientationParams.from_mapping({"fusion.local_field_sd": 0.01}))
