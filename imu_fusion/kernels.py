@@ -35,6 +35,7 @@ _PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+(imu_fusion[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)"
                      rb"|import[ \t]+(imu_fusion[\w.]*))", re.MULTILINE)
 _COMMENT = re.compile(rb"#[^\n]*")
+_INTERPRETED = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 _KEPT = 30 * 86400.0       # s, that compiled code of another source is kept without being written
 
 
@@ -43,7 +44,7 @@ def njit(function: Callable) -> Callable:
 
     With NUMBA_DISABLE_JIT it is interpreted, for debuggers and for coverage.
     """
-    if numba.config.DISABLE_JIT:
+    if _INTERPRETED:
         return _interpreted(function)
     dispatcher = numba.njit(fastmath=False)(function)
     directory = _directory(Path(function.__code__.co_filename))
@@ -66,7 +67,7 @@ def _interpreted(function: Callable) -> Callable:
     return call
 
 
-class _Record(np.void):
+class _Record(np.void):     # type: ignore[misc]
     """An element of a structured array. numpy's own would give its methods (max, cov) first."""
 
     def __getattribute__(self, name):
@@ -86,7 +87,7 @@ def entry_point(kernel: Callable, *arguments: object) -> Callable:
     A call of a kernel looks its arguments' types up, which costs 3 us where some are structured
     arrays; a call of what this returns does not. It takes arguments of just these types.
     """
-    if numba.config.DISABLE_JIT:
+    if _INTERPRETED:
         return kernel
     return kernel.compile(  # type: ignore[attr-defined]
         tuple(numba.typeof(argument) for argument in arguments))
@@ -194,10 +195,15 @@ def _directory(file: Path) -> Path | None:
     """Where the compiled functions of a file are, None if nowhere."""
     if not (file.exists() and file.is_relative_to(_PACKAGE)):
         return None    # typed in, or somebody else's
+    return cache_file(f"{file.stem}-{_version_of(file)[:24]}")
+
+
+@cache
+def _version_of(file: Path) -> str:
+    """A digest of all that the machine code of a file's kernels depends on."""
     sources = b"".join(str(f.relative_to(_PACKAGE.parent)).encode() + _digest(f)
                        for f in sorted(sources_of(file)))
-    digest = hashlib.sha256(versions().encode() + sources).hexdigest()
-    return cache_file(f"{file.stem}-{digest[:24]}")
+    return hashlib.sha256(versions().encode() + sources).hexdigest()
 
 
 def versions() -> str:

@@ -302,11 +302,15 @@ class Parameters:
         return dataclasses.replace(self, **own)
 
 
-@functools.cache
 def fields_of(cls: type) -> tuple[tuple[dataclasses.Field, Any], ...]:
     """(dataclass field, its annotation) of each field, in order."""
-    hints = typing.get_type_hints(cls)
-    return tuple((field, hints[field.name]) for field in dataclasses.fields(cls))
+    if cls not in _FIELDS:
+        hints = typing.get_type_hints(cls)
+        _FIELDS[cls] = tuple((field, hints[field.name]) for field in dataclasses.fields(cls))
+    return _FIELDS[cls]
+
+
+_FIELDS: dict[type, tuple[tuple[dataclasses.Field, Any], ...]] = {}
 
 
 def is_group(kind: Any) -> TypeGuard[type[Parameters]]:

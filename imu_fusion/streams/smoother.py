@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError, MessageError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
@@ -78,6 +78,9 @@ class SmoothingParams(SmootherParams):
 class SmootherNodeParams(EstimatorNodeParams):
     """What concerns the node, not the trajectory."""
 
+    smooth_at_end: bool = param(
+        False, doc="Smooth when a replay has ended, as if smoother/smooth were called. A refusal, "
+        "and a replay that plays not enough or breaks off, end the node with code 1.")
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
                                     "taken, and smoothing is refused until smoother/clear. Imu "
@@ -172,12 +175,13 @@ class SmootherStream(Stream):
                 for topic, parts in chosen.items() if parts}
 
     def conclude(self) -> Conclusion:
-        """What the samples of a whole recording make: the smoothed trajectory."""
+        """What the samples of a whole recording make: the smoothed trajectory; its detail is
+        (SmootherResult, logs by topic)."""
         logs = self.logs()
         result = smooth(self.params, logs)
         outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
         return Conclusion(messages(result.samples, outcome, self.params.path_rate),
-                          outcome.numbers, outcome.summary, outcome.remarks)
+                          outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
 
 
 def _length(stretch):
@@ -282,7 +286,7 @@ def _values(rows, frame):
     """Values of the messages of samples: Odometry and Imu in the order of their layouts, latitude,
     longitude, height and covariance; (n, size) each."""
     n = len(rows)
-    rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    rotation = scipy.spatial.transform.Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
     back = rotation.transpose(0, 2, 1)
     vel_imu = np.einsum("nij,nj->ni", back, rows["vel_world"])
     cov_attitude = rotation @ rows["cov_attitude"] @ back

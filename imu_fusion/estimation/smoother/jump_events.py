@@ -146,16 +146,17 @@ def impact_onset(imu: ImuLog, touchdown: int) -> tuple[int, float] | None:
     return int(peak_stamp + round(onset * 1e9)), step / np.sqrt(12.0)
 
 
-def table_crossing(hill: Hill, samples: np.ndarray, near: int) -> int | None:
-    """Stamp (ns) at which the smoothed trajectory passes the table edge (x = 0), near a first
-    guess; None when it does not within 2 s."""
-    around = np.abs(samples["stamp"] - near) < _NEAR_EDGE
-    stamp = samples["stamp"][around]
+def table_crossing(hill: Hill, samples: np.ndarray, near: int | None) -> int | None:
+    """Stamp (ns) at which the smoothed trajectory passes the table edge (x = 0), within 2 s of a
+    first guess, or at its fastest where there is none; None when it does not."""
+    stamp = samples["stamp"]
+    around = np.ones(len(stamp), bool) if near is None else np.abs(stamp - near) < _NEAR_EDGE
+    stamp = stamp[around]
     x = hill.to_hill(samples["position_world"][around])[:, 0]
     crossing = np.flatnonzero((x[:-1] < 0) & (x[1:] >= 0))
     if not len(crossing):
         return None
-    i = int(crossing[0])
+    i = int(crossing[0 if near is not None else np.argmax(x[crossing + 1] - x[crossing])])
     return int(stamp[i] + round((stamp[i + 1] - stamp[i]) * float(-x[i] / (x[i + 1] - x[i]))))
 
 

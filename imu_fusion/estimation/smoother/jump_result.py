@@ -77,7 +77,8 @@ def _in_run_speed(hill, samples, takeoff):
                                     0.0, np.zeros(3))
 
 
-def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents) -> JumpResult:
+def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents,
+                misfit: float = 1.0) -> JumpResult:
     """Read the results of a jump off the smoothed samples.
 
     The length is that of the landing profile up to the touch-down; its standard deviation
@@ -90,6 +91,7 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
         samples: structured array of the smoother.
         imu: ImuLog.
         events: JumpEvents.
+        misfit: factor of the standard deviations at the touch-down.
 
     Raises:
         EstimationError: the touch-down is not beyond the table.
@@ -110,8 +112,8 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
     slope = float(hill.landing(x)[1])
     forward = hill.axes[0]
     cov_x = np.einsum("i,nij,j->n", forward, samples["cov_position"], forward)
-    length_sd = np.hypot(1.0, slope) * np.hypot(np.sqrt(cov_x[touch]),
-                                                timing * (forward @ landing))
+    length_sd = misfit * np.hypot(1.0, slope) * np.hypot(np.sqrt(cov_x[touch]),
+                                                         timing * (forward @ landing))
     edge_timing = np.sqrt(cov_x[edge]) / (forward @ takeoff)
     takeoff_speed, landing_speed = np.linalg.norm(takeoff), np.linalg.norm(landing)
     horizontal = np.hypot(*takeoff[:2])
@@ -127,5 +129,5 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
         flight_time=(events.touchdown - events.takeoff) * 1e-9,
         flight_time_sd=float(np.hypot(timing, edge_timing)),
         length=float(hill.jump_length(x)), length_sd=float(length_sd),
-        landing_speed=float(landing_speed), landing_speed_sd=_sd(
+        landing_speed=float(landing_speed), landing_speed_sd=misfit * _sd(
             landing / landing_speed, cov_velocity[touch], timing, down_acc))

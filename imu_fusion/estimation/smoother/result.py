@@ -24,6 +24,8 @@ _MISFIT = 3.0
 # 1.7 where it is 6 deg off.
 _SINGLE_PASS = 1.3
 _EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
+# Simulated jumps, sunk by 0.3 m: up to 1.4; by 0.7 m, or a fall of 0.4 m: from 2.5.
+_FIRST_EXCESS = 2.0
 _SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
@@ -55,6 +57,7 @@ class SmootherResult:
     ``surface``: name of a constraint -> SurfaceFit.
     ``cost``: of the trajectory before each step; ``iterations`` counts the steps;
     ``converged``: None where the method passes once and so cannot tell.
+    ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
     samples: np.ndarray
@@ -67,6 +70,7 @@ class SmootherResult:
     events: JumpEvents | None = None
     jump: JumpResult | None = None
     surface: dict[str, SurfaceFit] = field(default_factory=dict)
+    failure: str = ""
 
     def summary(self) -> str:
         """One line."""
@@ -132,6 +136,12 @@ class SmootherResult:
             if fit.silent > _SILENT:
                 texts.append(f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of "
                              "the samples that it should hold: its grid may end there")
+            if fit.first_excess > _FIRST_EXCESS and fit.excess <= _EXCESS and self.jump:
+                texts.append(
+                    f"in the first second the trajectory stands off the surface ({name}) by "
+                    f"{fit.first_excess:.1f} times as much as its sigma of {fit.sigma:g} m allows: "
+                    "a fall, a deep landing or another touch-down; standard deviations of the "
+                    "landing are as much larger (jump.event_margin, jump.touchdown)")
             if fit.excess > _EXCESS:
                 texts.append(
                     f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "

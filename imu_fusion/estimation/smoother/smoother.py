@@ -16,8 +16,13 @@ from imu_fusion.estimation.smoother.problem import Problem
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.state import StatePrior
-from imu_fusion.estimation.smoother.surface_fit import at_surface, surface_fits
+from imu_fusion.estimation.smoother.surface_fit import (
+    at_surface,
+    misfit_at_landing,
+    surface_fits,
+)
 from imu_fusion.estimation.smoother.surroundings import surroundings_of
+from imu_fusion.estimation.smoother.touch_down import likeliest
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.surfaces.constraint import Surface
@@ -65,7 +70,8 @@ class Smoother:
         fix = required(fix)
         frame = reference_frame(surface, fix)
         constraints = surface.constraints() if surface is not None else ()
-        if events is None and any(c.phase != "always" for c in constraints):
+        detected = events is None and any(c.phase != "always" for c in constraints)
+        if detected:
             events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
         readings = prepare_readings({"fix": fix, "velocity": velocity, "mag": mag}, frame, params)
         measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
@@ -73,18 +79,11 @@ class Smoother:
         problem = Problem(prepared, params, readings, around, constraints,
                           StatePrior.of(params, measured))
         hill = surface if isinstance(surface, Hill) and events is not None else None
-
-        def refine(problem: Problem, events: JumpEvents) -> JumpEvents:
-            return events if hill is None else refine_jump(hill, _positions(problem), prepared.log,
-                                                           events)
-
         best = None
         for quat in first_attitudes(problem, mag, initial_quat)[:_STARTS]:
-            attempt = problem.from_attitude(quat)
-            solution = solve(attempt, events if hill is not None else None, refine)
-            if not np.isfinite(attempt.x).all():
+            result = _smooth(problem, frame, hill, quat, events)
+            if result is None:
                 continue
-            result = _result(attempt, frame, hill, solution)
             if best is None or result.cost[-1] < best.cost[-1]:
                 best = result
             if result.converged and result.misfit().get("fix", np.inf) < _PLAUSIBLE:
@@ -92,7 +91,25 @@ class Smoother:
         if best is None:
             raise EstimationError("the smoother diverged: noise far below that of the data, or "
                                   "measurements of another recording")
+        if detected and hill is not None and params.jump.touchdown is None:
+            quat = best.samples["quat_world_imu"][0]
+            best = likeliest(best, hill, prepared.log, params,
+                             lambda events: _smooth(problem, frame, hill, quat, events))
+        if best.failure:
+            raise EstimationError(best.failure)
         return best
+
+
+def _smooth(problem: Problem, frame: LocalFrame, hill: Hill | None, quat: np.ndarray,
+            events: JumpEvents | None) -> SmootherResult | None:
+    """From one first attitude; None where it diverges."""
+    def refine(problem: Problem, events: JumpEvents) -> JumpEvents:
+        return events if hill is None else refine_jump(hill, _positions(problem), problem.imu.log,
+                                                       events)
+
+    attempt = problem.from_attitude(quat)
+    solution = solve(attempt, events if hill is not None else None, refine)
+    return _result(attempt, frame, hill, solution) if np.isfinite(attempt.x).all() else None
 
 
 def _positions(problem: Problem) -> np.ndarray:
@@ -113,10 +130,14 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             width = len(measurement.components)
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],
                                              problem.innovation[of_kind][:, :width])
-    jump = None
-    if hill is not None and solution.events is not None:
-        jump = jump_result(hill, at_surface(samples, states, problem.params), problem.imu.log,
-                           solution.events)
     fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
+    jump, failure = None, ""
+    if hill is not None and solution.events is not None:
+        try:
+            jump = jump_result(hill, at_surface(samples, states, problem.params),
+                               problem.imu.log, solution.events, misfit_at_landing(fits))
+        except EstimationError as error:
+            failure = str(error)
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
-                          solution.steps, solution.converged, solution.events, jump, fits)
+                          solution.steps, solution.converged, solution.events, jump, fits,
+                          failure)

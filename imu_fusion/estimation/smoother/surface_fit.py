@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
@@ -27,6 +27,8 @@ class SurfaceFit:
     ``excess``: RMS of the means over stretches of a second (``surface.interval`` if longer), by
     the standard deviation that sigma gives such a mean. The smoother pulls the trajectory to
     the surface, so a surface that fits leaves less than 1.
+    ``first_excess``: the same of stretches of a fifth of a second, over the first second in which
+    it holds: a body that lands may sink or fall against what it stands on.
     ``silent``: share of the samples at which the constraint should hold, but the surface says
     nothing (outside of an elevation grid).
     """
@@ -37,6 +39,7 @@ class SurfaceFit:
     rms: float
     largest: float
     excess: float
+    first_excess: float = 0.0
     silent: float = 0.0
 
 
@@ -58,7 +61,7 @@ def at_surface(samples: np.ndarray, states: dict[str, tuple[np.ndarray, np.ndarr
     lever = np.broadcast_to(lever, samples["position_world"].shape)
     lever_cov = np.broadcast_to(lever_sd, lever.shape)[:, None] ** 2 * np.eye(3)
     gyr_cov = samples["gyr_sd"][:, None] ** 2 * np.eye(3)
-    turn = Rotation.from_quat(samples["quat_world_imu"]).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"]).as_matrix()
     swing = np.cross(samples["gyr"], lever)
 
     def crossed(v):
@@ -105,11 +108,14 @@ def surface_fits(constraints: Sequence[Constraint], samples: np.ndarray,
             height = states["body_height"][0][sample, 0] if "body_height" in states \
                 else params.surface.body_height
             residual = residual - height
+        stamp, interval = samples["stamp"][sample], params.surface.interval
+        first = stamp < stamp[0] + _STRETCH * 1e9
         fits[constraint.name] = SurfaceFit(
             sample, residual, constraint.sigma, float(np.sqrt(np.mean(residual ** 2))),
             float(np.abs(residual).max()),
-            _excess(samples["stamp"][sample], residual, contacts["sigma"],
-                    params.surface.interval),
+            _excess(stamp, residual, contacts["sigma"], max(_STRETCH, interval)),
+            _excess(stamp[first], residual[first], contacts["sigma"][first],
+                    max(0.2 * _STRETCH, interval)),
             1.0 - len(residual) / active.sum())
     if constraints and not fits:
         raise EstimationError("the surface says nothing at any sample of this recording: an "
@@ -118,8 +124,15 @@ def surface_fits(constraints: Sequence[Constraint], samples: np.ndarray,
     return fits
 
 
-def _excess(stamp, residual, sigma, interval):
-    stretch = (stamp - stamp[0]) // round(max(_STRETCH, interval) * 1e9)
+def misfit_at_landing(fits: dict[str, SurfaceFit]) -> float:
+    """Factor, at least 1, by which a landing off its profile makes a jump less certain: the ratio
+    of deviations to what they should be (Birge's), of the first second or of all."""
+    fit = fits.get("landing")
+    return 1.0 if fit is None else max(1.0, fit.first_excess, fit.excess)
+
+
+def _excess(stamp, residual, sigma, length):
+    stretch = (stamp - stamp[0]) // round(length * 1e9)
     stretch = np.unique(stretch, return_inverse=True)[1]
     information = np.bincount(stretch, 1.0 / sigma ** 2)
     means = np.bincount(stretch, residual / sigma ** 2)

@@ -1,0 +1,129 @@
+"""Which impact was the touch-down: candidates, each smoothed, compared by what they explain.
+
+The largest force after take-off need not be the landing: on a short or soft jump the curve of the
+out-run, or braking, is stronger. A wrong touch-down contradicts the hill: while the jumper slides,
+a "flight" follows the profile; or the contact is claimed where the trajectory is in the air.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from imu_fusion.estimation.smoother.jump_events import JumpEvents, table_crossing
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.estimation.smoother.surface_fit import SurfaceFit, at_surface
+from imu_fusion.samples.logs import ImuLog
+from imu_fusion.surfaces.constraint import Constraint
+from imu_fusion.surfaces.hill import Hill
+
+_CLOSE = 0.3          # m above the profile, within which a body is not in the air
+_FOLLOWS = 0.3        # s, for which a flight may be so close: the last drop takes less
+_SHORTEST = 0.3       # s, that a flight takes at least: what is earlier belongs to the push-off
+_APART = 0.3          # s, between two impacts
+_RISE = 2.0           # m/s^2, of an impact above the force before it
+_MOST = 8             # impacts that are tried, the largest
+_MISFIT = 1.5         # excess of a surface, from which a contact is doubted
+_SPREAD = 1.0         # m, over which heights in the air are spread: what a contact is told from
+
+
+def likeliest(first: SmootherResult, hill: Hill, imu: ImuLog, params: SmootherParams,
+              smooth: Callable[[JumpEvents], SmootherResult | None]) -> SmootherResult:
+    """The result with the likeliest touch-down; the first one unless the hill contradicts it.
+
+    Args:
+        first: smoothed with the events that were detected.
+        imu: of the recording. params: SmootherParams.
+        smooth: result for given events, None where there is none.
+    """
+    constraints = hill.constraints()
+    landing = next(c for c in constraints if c.phase == "landing" and c.height)
+    height = _height(first, landing, params)
+    stamp, events = first.samples["stamp"], first.events
+    assert events is not None
+    if first.jump is not None and not is_doubtful(height, stamp, events,
+                                                  first.surface.get(landing.name)):
+        return first
+    takeoff = table_crossing(hill, first.samples, None) or events.takeoff
+    tries = [first_contact(height, stamp, events), *impacts(imu, takeoff)]
+    others = [smooth(JumpEvents(takeoff, touchdown)) for touchdown in tries
+              if abs(touchdown - events.touchdown) > _APART * 1e9 or first.jump is None]
+    results = [r for r in (first, *others) if r is not None and r.jump is not None]
+    if not results:
+        return first
+    return min(results, key=lambda r: unexplained(r, constraints, params))
+
+
+def is_doubtful(height: np.ndarray, stamp: np.ndarray, events: JumpEvents,
+                fit: SurfaceFit | None) -> bool:
+    """Whether a flight follows the profile, or a landing does not.
+
+    Args:
+        height: (n,) m above the landing profile; stamp: (n,) ns. events: of this result.
+        fit: of the landing, None if it holds nowhere.
+    """
+    if fit is None or fit.excess > _MISFIT:
+        return True
+    return events.touchdown - first_contact(height, stamp, events) > _FOLLOWS * 1e9
+
+
+def first_contact(height: np.ndarray, stamp: np.ndarray, events: JumpEvents) -> int:
+    """Stamp from which on, until the touch-down, the trajectory is close to the profile."""
+    air = (stamp > events.takeoff + _SHORTEST * 1e9) & (stamp < events.touchdown)
+    high = np.flatnonzero(air & ~(np.abs(height) < _CLOSE))
+    if len(high):
+        return int(stamp[high[-1]])
+    return int(stamp[air][0]) if air.any() else events.touchdown
+
+
+def impacts(imu: ImuLog, takeoff: int) -> np.ndarray:
+    """Stamps (k,) ns of the peaks of force after a take-off, the largest rises first."""
+    after = imu.stamp > takeoff + _SHORTEST * 1e9
+    stamp, force = imu.stamp[after], np.linalg.norm(imu.acc[after], axis=1)
+    rises: list[tuple[float, int]] = []
+    for i in np.argsort(-force, kind="stable"):
+        if all(abs(int(stamp[i]) - other) > _APART * 1e9 for _, other in rises):
+            before = force[(stamp < stamp[i]) & (stamp > stamp[i] - 2 * _APART * 1e9)]
+            rise = force[i] - np.median(before) if len(before) else 0.0
+            if rise > _RISE:
+                rises.append((rise, int(stamp[i])))
+        if len(rises) == 3 * _MOST:
+            break
+    return np.array([at for _, at in sorted(rises, reverse=True)[:_MOST]], np.int64)
+
+
+def unexplained(result: SmootherResult, constraints: Sequence[Constraint],
+                params: SmootherParams) -> float:
+    """Negative log-likelihood of the touch-down of a result, up to a constant of the recording.
+
+    The cost alone would favour the shortest contact. A row of contact is normal about the
+    surface, where a height in the air is spread over metres: each expected height counts for
+    contact by the ratio of the two densities. Nothing flies below the ground: there a height
+    counts as it would in contact.
+    """
+    assert result.events is not None
+    stamp, events = result.samples["stamp"], result.events
+    step = np.median(np.diff(stamp)) * 1e-9 / params.surface.interval
+    lasting = max(0.0, (stamp[-1] - events.touchdown) * 1e-9 - params.jump.event_margin)
+    air = (stamp > events.takeoff + _SHORTEST * 1e9) & (
+        stamp < events.touchdown + params.jump.event_margin * 1e9)
+    cost = result.cost[-1]
+    for constraint in constraints:
+        if constraint.phase != "landing":
+            continue
+        below = np.minimum(_height(result, constraint, params)[air], 0.0) / constraint.sigma
+        cost += step * np.nansum(np.log1p(0.5 * below ** 2))
+        fit = result.surface.get(constraint.name)
+        if fit is not None:
+            # Who falls, or sinks deeply, is beside the profile for a while and yet has landed.
+            squares = 0.5 * (fit.residual / constraint.sigma) ** 2
+            cost -= step * np.sum(squares - np.log1p(squares))
+        cost -= lasting / params.surface.interval * np.log(
+            _SPREAD / (np.sqrt(2.0 * np.pi) * constraint.sigma))
+    return float(cost)
+
+
+def _height(result, landing, params):
+    """Heights (n,) m of the body above the landing profile."""
+    points = at_surface(result.samples, result.states, params)["position_world"]
+    return landing.evaluate(points)[0] - params.surface.body_height
