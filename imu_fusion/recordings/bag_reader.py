@@ -6,9 +6,11 @@ over what is damaged. The data files are what counts; metadata.yaml only says wh
 together, and where it contradicts them it is said and not believed.
 """
 
+import re
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,7 +25,6 @@ from imu_fusion.recordings.sqlite_storage import SqliteStorage
 from imu_fusion.recordings.storage import (
     DamageError,
     Part,
-
     Storage,
     StoredTopic,
     in_order,
@@ -38,6 +39,7 @@ _PACKED = ".zstd"          # rosbag2's --compression-mode file
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message of its --compression-mode message; CDR never does
 _LARGEST_RATIO = 1000      # of a file and what it unpacks to
 _PIECE = 1 << 20
+_NAME = re.compile(r"[A-Za-z0-9_/~.:{}-]+")    # of topics and types; more than ROS permits
 
 
 @dataclass
@@ -134,7 +136,7 @@ class Reader:
         self.topics: dict[str, TopicInfo] = {}
         self.start_time = self.end_time = 0
         self.warnings: list[str] = []
-        self.damaged = False
+        self.damaged = False    # messages are lost
         self._storages: list[Storage] = []
         self._stored: dict[str, StoredTopic] = {}
         self._temporary: list[Any] = []
@@ -152,10 +154,10 @@ class Reader:
                            "to it")
         for file in files:
             if file.stat().st_size == 0:
-                self._warn(f"{file.name} is empty (0 bytes)")
+                self.lose(f"{file.name} is empty (0 bytes)")
                 continue
             plain = self._plain(file) if file.suffix == _PACKED else file
-            storage = _STORAGES[plain.suffix](plain, self._warn)
+            storage = _STORAGES[plain.suffix](plain, self.lose, self.mention)
             self._storages.append(storage)
             self._add(storage)
         times = [time for storage in self._storages for time in storage.times or ()]
@@ -193,7 +195,7 @@ class Reader:
         """
         wanted = {name for name in self.topics if topics is None or name in topics}
         parts = [Part(storage.times[0] if storage.times else 0, 0,
-                      lambda storage=storage: storage.messages(wanted, start, stop))
+                      partial(storage.messages, wanted, start, stop))
                  for storage in self._storages]
         rows = in_order(parts) if len(parts) > 1 else parts[0].rows()
         try:
@@ -206,7 +208,7 @@ class Reader:
                 yield topic, self.topics[topic].msgtype, log_time, data
         except ImuFusionError:
             raise
-        except Exception as error:    # noqa: BLE001, of libraries: the one boundary to them
+        except Exception as error:
             raise BagError(f"{self.path}: damaged beyond reading ({type(error).__name__}: {error})"
                            ) from error
 
@@ -238,6 +240,9 @@ class Reader:
     def _add(self, storage: Storage) -> None:
         """The topics of one more file."""
         for name, stored in storage.topics.items():
+            if not (_NAME.fullmatch(name) and _NAME.fullmatch(stored.msgtype)):
+                storage.left_out.append(f"{ascii(name)} ({ascii(stored.msgtype)})")
+                continue
             info = self.topics.get(name)
             if info is None:
                 self._stored[name] = stored
@@ -246,11 +251,16 @@ class Reader:
             elif info.msgtype == stored.msgtype:
                 info.count += stored.count
             else:
-                self._warn(f"{storage.path.name}: topic {name} is {stored.msgtype} there, and "
+                self.lose(f"{storage.path.name}: topic {name} is {stored.msgtype} there, and "
                            f"{info.msgtype} in other files; read as the latter")
 
-    def _warn(self, text: str) -> None:
+    def lose(self, text: str) -> None:
+        """Say, once, that a part of the recording cannot be used."""
         self.damaged = True
+        self.mention(text)
+
+    def mention(self, text: str) -> None:
+        """Say something, once, that costs no message."""
         if text not in self.warnings:
             self.warnings.append(text)
 
@@ -271,7 +281,7 @@ class Reader:
                                        "size; unpack it yourself (zstd -d) if that is right")
                     temporary.write(data)
         except zstandard.ZstdError as error:
-            self._warn(f"{file.name}: damaged ({error}); what unpacks before is read")
+            self.lose(f"{file.name}: damaged ({error}); what unpacks before is read")
         temporary.flush()
         if not size:
             raise BagError(f"{file}: cannot be unpacked, it is no zstd file or damaged at its "
@@ -286,7 +296,7 @@ class Reader:
                 raise DamageError("its size is not stated")
             return unpack(data, "zstd", size)
         except (DamageError, zstandard.ZstdError) as error:
-            self._warn(f"topic {topic}: compressed messages are broken and left out ({error})")
+            self.lose(f"topic {topic}: compressed messages are broken and left out ({error})")
             return None
 
 

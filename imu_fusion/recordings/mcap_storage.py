@@ -5,15 +5,18 @@ at the end is a convenience that a crash leaves out. Where no record follows, th
 searched for; a chunk is checked when it is unpacked, and left out if its bytes have changed.
 """
 
+import contextlib
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from imu_fusion.errors import BagError
 from imu_fusion.recordings.qos import read_profiles
 from imu_fusion.recordings.storage import (
     DamageError,
@@ -70,7 +73,6 @@ class _Block:
     first: int | None = None
     last: int | None = None
     counts: dict[int, int] = field(default_factory=dict)   # messages of each channel
-    doubtful: bool = False                                 # what follows it is no record
 
     def saw(self, first: int, last: int) -> None:
         """Its log times are at least from ``first`` to ``last``."""
@@ -81,8 +83,9 @@ class _Block:
 class McapStorage(Storage):
     """See :class:`imu_fusion.recordings.storage.Storage`."""
 
-    def __init__(self, path: Path, warn: Callable[[str], object]) -> None:
-        super().__init__(path, warn)
+    def __init__(self, path: Path, lose: Callable[[str], object],
+                 mention: Callable[[str], object]) -> None:
+        super().__init__(path, lose, mention)
         self._file = Window(path)
         self._blocks: list[_Block] = []
         self._channels: dict[int, _Channel] = {}
@@ -90,13 +93,15 @@ class McapStorage(Storage):
         # Those of the index: good as long as its checksum says so.
         self._index: tuple[dict[int, _Channel], dict[int, _Schema]] = {}, {}
         self._in_index = False
-        self._complete = False
-        self._holes: list[tuple[int, int | None]] = []    # (bytes, number of the block after)
+        self._holes: list[tuple[int, int, _Block]] = []   # (bytes, number of the block after, lost)
+        self._lost: _Block | None = None    # a chunk that is no more, though its index may be
         try:
             self._walk()
             self._learn_channels()
             self._make_topics()
             self._tell_holes()
+            if not self._blocks and not self._channels and self._file.read(0, 8) != MAGIC:
+                raise BagError(f"{path}: not an MCAP file, or damaged beyond reading")
         except BaseException:
             self._file.close()
             raise
@@ -110,7 +115,7 @@ class McapStorage(Storage):
                   if channel.topic in topics and channel.topic in self.topics
                   and self._type_of(channel)}
         parts = [Part(block.first or 0, block.unpacked,
-                      lambda block=block: self._rows(block, wanted, start, stop))
+                      partial(self._rows, block, wanted, start, stop))
                  for block in self._blocks
                  if (not block.counts or not wanted.keys().isdisjoint(block.counts))
                  and (block.first is None or stop is None or block.first < stop)
@@ -124,7 +129,6 @@ class McapStorage(Storage):
         size = self._file.size
         while position < size:
             if size - position == len(MAGIC) and self._file.read(position, 8) == MAGIC:
-                self._complete = self._in_index
                 return
             end = self._end_of(position)
             if end is None or not self._is_followed(position, end):
@@ -138,14 +142,25 @@ class McapStorage(Storage):
         start = position + 1
         block = self._blocks[-1] if self._blocks else None
         if block is not None and block.compression is not None and (
-                block.position + block.size == position):
+                block.position + block.size == position and not self._is_sound(block)):
             # The chunk before it is shorter than it says: bytes are missing in it.
-            block.doubtful = True
-            start = block.position
+            self._blocks.pop()
+            position = start = block.position
         found = self._find(start)
-        self._holes.append((found - position, None if found >= self._file.size
-                            else len(self._blocks)))
+        if self._in_index:
+            self.mention(f"{self.path.name}: not closed properly: its index is damaged or cut off; "
+                         "it is read without")
+        else:
+            self._lost = _Block(position, 0, 0, "")
+            self._holes.append((found - position, len(self._blocks), self._lost))
         return found
+
+    def _is_sound(self, block: _Block) -> bool:
+        try:
+            self._unpacked(block)
+        except DamageError:
+            return False
+        return bool(block.crc)
 
     def _end_of(self, position: int) -> int | None:
         """Where the record at ``position`` ends, None if there is none."""
@@ -231,6 +246,8 @@ class McapStorage(Storage):
     def _take(self, position: int, end: int) -> None:
         opcode = self._file.read(position, 1)[0]
         content = position + _HEAD.size
+        if opcode in (_CHUNK, _MESSAGE):
+            self._lost = None
         if opcode == _CHUNK:
             self._take_chunk(content, end)
         elif opcode == _INDEX:
@@ -260,7 +277,7 @@ class McapStorage(Storage):
 
     def _take_index(self, content: bytes) -> None:
         """How many messages of a channel the chunk before it holds, and when."""
-        block = self._blocks[-1] if self._blocks else None
+        block = self._lost or (self._blocks[-1] if self._blocks else None)
         if block is None or block.compression is None or len(content) < 22:
             return
         (number,) = struct.unpack_from("<H", content)
@@ -289,13 +306,13 @@ class McapStorage(Storage):
             value = zlib.crc32(self._file.read(start + offset, min(_SEARCH, size - offset)), value)
         if value != crc:
             self._index = {}, {}
-            self.warn(f"{self.path.name}: its index is damaged; read without it")
+            self.mention(f"{self.path.name}: its index is damaged; it is read without")
 
     def _learn_channels(self) -> None:
         """Find the channels that messages name: beside the chunks, else inside of them."""
-        for own, index in zip((self._channels, self._schemas), self._index):
-            for number, record in index.items():
-                own.setdefault(number, record)  # type: ignore[attr-defined]
+        channels, schemas = self._index
+        self._channels = channels | self._channels
+        self._schemas = schemas | self._schemas
         tries: dict[int, int] = {}
         for block in self._blocks:
             if block.compression is None:
@@ -306,17 +323,18 @@ class McapStorage(Storage):
                 continue
             try:
                 data = self._unpacked(block)
-            except DamageError:
-                continue    # told when it is read
+            except DamageError as error:
+                self._lose_chunk(block, error)
+                if block.compression or not unknown:
+                    continue
+                data = self._file.read(block.position, block.size)    # definitions may be sound
             for number in unknown:
                 tries[number] = tries.get(number, 0) + 1
             counted = bool(block.counts)
             for opcode, content in _records(data):
                 if opcode in (_SCHEMA, _CHANNEL):
-                    try:
+                    with contextlib.suppress(DamageError):
                         _define(opcode, content, self._channels, self._schemas)
-                    except DamageError:
-                        continue
                 elif opcode == _MESSAGE and not counted and len(content) >= _MESSAGE_HEAD.size:
                     number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
                     block.counts[number] = block.counts.get(number, 0) + 1
@@ -359,33 +377,35 @@ class McapStorage(Storage):
             topic.count += counts.get(number, 0)
         for name, kinds in several.items():
             del self.topics[name]
-            self.warn(f"topic {name} holds several types ({', '.join(sorted(kinds))}) and is left "
+            self.lose(f"topic {name} holds several types ({', '.join(sorted(kinds))}) and is left "
                       "out")
         unknown = sum(n for number, n in counts.items() if number not in self._channels)
         if unknown:
-            self.warn(f"{self.path.name}: {unknown} messages are of channels whose definition is "
+            self.lose(f"{self.path.name}: {unknown} messages are of channels whose definition is "
                       "lost with a damaged part; they are left out")
 
     def _tell_holes(self) -> None:
-        for size, after in self._holes:
-            before = self._blocks[:after] if after is not None else self._blocks
-            last = next((b.last for b in reversed(before) if not b.doubtful
-                         and b.last is not None), None)
-            first = None if after is None else next(
-                (b.first for b in self._blocks[after:] if b.first is not None), None)
-            self.warn(f"{self.path.name}: {max(size, 0)} bytes are damaged or cut off; messages of "
-                      f"{span(last, first)} may be missing")
-        if not self._complete and not self._holes:
-            self.warn(f"{self.path.name}: not closed properly; what was not yet written to the "
-                      "disk is missing")
+        for size, after, lost in self._holes:
+            last = next((b.last for b in reversed(self._blocks[:after]) if b.last is not None),
+                        None)
+            first = next((b.first for b in self._blocks[after:] if b.first is not None), None)
+            where = "damaged" if after < len(self._blocks) else (
+                "damaged or cut off: the file is not closed properly; what comes before is "
+                "recovered")
+            which = (f"messages of {span(last, first)} may be missing" if not lost.counts else
+                     f"{sum(lost.counts.values())} messages of {span(lost.first, lost.last)} are "
+                     "missing")
+            self.lose(f"{self.path.name}: {size if size > 0 else 'some'} bytes are {where}; "
+                      f"{which}")
+        if not self._in_index and not self._holes:
+            self.lose(f"{self.path.name}: not closed properly; what comes before is recovered, "
+                      "what was not yet written to the disk is missing")
 
     # Messages.
 
     def _unpacked(self, block: _Block) -> bytes:
         if block.compression is None:
             return self._file.read(block.position, block.size)
-        if block.doubtful and not block.crc:
-            raise DamageError("bytes of it are missing")
         if block.compression == "" and block.unpacked != block.size:
             raise DamageError(f"it unpacks to another size than the {block.unpacked} bytes stated")
         data = unpack(self._file.read(block.position, block.size), block.compression,
@@ -394,14 +414,17 @@ class McapStorage(Storage):
             raise DamageError("its checksum does not fit")
         return data
 
+    def _lose_chunk(self, block: _Block, error: DamageError) -> None:
+        count = sum(block.counts.values()) or "its"
+        self.lose(f"{self.path.name}: a chunk at byte {block.position} is left out: {error}; "
+                  f"{count} messages of {span(block.first, block.last)} are missing")
+
     def _rows(self, block: _Block, wanted: dict[int, str], start: int | None,
               stop: int | None) -> Iterator[Row]:
         try:
             data = self._unpacked(block)
         except DamageError as error:
-            count = sum(block.counts.values())
-            self.warn(f"{self.path.name}: a chunk at byte {block.position} is left out: {error}; "
-                      f"{count or 'its'} messages of {span(block.first, block.last)} are missing")
+            self._lose_chunk(block, error)
             return iter(())
         rows = []
         for opcode, content in _records(data):

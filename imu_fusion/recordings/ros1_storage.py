@@ -10,6 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -64,8 +65,9 @@ class _Connection:
 class Ros1Storage(Storage):
     """See :class:`imu_fusion.recordings.storage.Storage`."""
 
-    def __init__(self, path: Path, warn: Callable[[str], object]) -> None:
-        super().__init__(path, warn)
+    def __init__(self, path: Path, lose: Callable[[str], object],
+                 mention: Callable[[str], object]) -> None:
+        super().__init__(path, lose, mention)
         self._file = Window(path)
         self._chunks: list[_Chunk] = []
         self._connections: dict[int, _Connection] = {}
@@ -80,6 +82,8 @@ class Ros1Storage(Storage):
             self._count()
             self._make_topics()
             self._tell_holes()
+            if not self._chunks:
+                self.lose(f"{path.name}: holds no chunk: nothing was written, or the rest is lost")
         except BaseException:
             self._file.close()
             raise
@@ -92,12 +96,12 @@ class Ros1Storage(Storage):
         wanted = {number: connection for number, connection in self._connections.items()
                   if connection.topic in topics and connection.topic in self._stores}
         parts = [Part(chunk.first or 0, chunk.unpacked,
-                      lambda chunk=chunk: self._rows(chunk, wanted, start, stop))
+                      partial(self._rows, chunk, wanted, start, stop))
                  for chunk in self._chunks
                  if not chunk.counts or not wanted.keys().isdisjoint(chunk.counts)]
         yield from in_order(parts)
         for topic, count in self._broken.items():
-            self.warn(f"topic {topic}: {count} messages do not fit their definition and are left "
+            self.lose(f"topic {topic}: {count} messages do not fit their definition and are left "
                       "out")
 
     def _walk(self) -> None:
@@ -106,9 +110,10 @@ class Ros1Storage(Storage):
             record = _record(self._file, position)
             if record is None or not self._take(*record[:3]):
                 start = position + 1
-                if self._chunks and self._chunks[-1].position <= position <= (
-                        self._chunks[-1].position + self._chunks[-1].size):
-                    start = self._chunks[-1].position    # bytes are missing in it
+                chunk = self._chunks[-1] if self._chunks else None
+                if chunk is not None and chunk.position + chunk.size == position:
+                    # Perhaps it is shorter than it says: what is inside of it is no chunk.
+                    start = chunk.position
                 found = self._find(start)
                 self._holes.append((found - position, len(self._chunks)))
                 position = found
@@ -203,7 +208,7 @@ class Ros1Storage(Storage):
         for number, connection in self._connections.items():
             topic = self.topics.get(connection.topic)
             if topic is not None and topic.msgtype != connection.msgtype:
-                self.warn(f"topic {topic.name} holds several types and is read as {topic.msgtype}")
+                self.lose(f"topic {topic.name} holds several types and is read as {topic.msgtype}")
                 continue
             if topic is None:
                 try:
@@ -224,8 +229,8 @@ class Ros1Storage(Storage):
             last = next((c.last for c in reversed(self._chunks[:after]) if c.last is not None),
                         None)
             first = next((c.first for c in self._chunks[after:] if c.first is not None), None)
-            self.warn(f"{self.path.name}: {max(size, 0)} bytes are damaged or cut off; messages of "
-                      f"{span(last, first)} may be missing")
+            self.lose(f"{self.path.name}: {size if size > 0 else 'some'} bytes are damaged or cut "
+                      f"off; messages of {span(last, first)} may be missing")
 
     def _unpacked(self, chunk: _Chunk) -> bytes:
         data = self._file.read(chunk.position, chunk.size)
@@ -254,7 +259,7 @@ class Ros1Storage(Storage):
                         start is None or time >= start) and (stop is None or time < stop):
                     rows.append((time, connection, content))
         except DamageError as error:
-            self.warn(f"{self.path.name}: a chunk at byte {chunk.position} is damaged: {error}; "
+            self.lose(f"{self.path.name}: a chunk at byte {chunk.position} is damaged: {error}; "
                       f"of its {sum(chunk.counts.values())} messages of "
                       f"{span(chunk.first, chunk.last)} {len(rows)} are read")
         rows.sort(key=lambda row: row[0])
@@ -262,7 +267,7 @@ class Ros1Storage(Storage):
             try:
                 cdr = bytes(self._stores[connection.topic].ros1_to_cdr(
                     bytes(content), connection.msgtype))
-            except Exception:    # noqa: BLE001, code that rosbags makes from the definition
+            except Exception:
                 self._broken[connection.topic] = self._broken.get(connection.topic, 0) + 1
                 continue
             yield time, connection.topic, cdr
@@ -291,7 +296,7 @@ def _store(connection: _Connection) -> Typestore:
         return store
     except DamageError:
         raise
-    except Exception as error:    # noqa: BLE001, whatever a parser makes of a hostile text
+    except Exception as error:
         raise DamageError(f"its definition cannot be read ({str(error)[:100]})") from None
 
 

@@ -21,8 +21,9 @@ _SMALLEST = 32           # bytes that a row takes at least: bounds the rows that
 class SqliteStorage(Storage):
     """See :class:`imu_fusion.recordings.storage.Storage`."""
 
-    def __init__(self, path: Path, warn: Callable[[str], object]) -> None:
-        super().__init__(path, warn)
+    def __init__(self, path: Path, lose: Callable[[str], object],
+                 mention: Callable[[str], object]) -> None:
+        super().__init__(path, lose, mention)
         address = f"file:{quote(str(path.resolve()))}?mode=ro"
         self._database = sqlite3.connect(address, uri=True, check_same_thread=False)
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(largest_chunk(), 10**9))
@@ -56,7 +57,7 @@ class SqliteStorage(Storage):
                 if isinstance(data, bytes) and isinstance(stamp, int):
                     yield stamp, wanted[number], data
         except (sqlite3.Error, OverflowError, MemoryError) as error:
-            self.warn(f"{self.path.name}: damaged after {span(done[0] or None, None)} ({error}); "
+            self.lose(f"{self.path.name}: damaged after {span(done[0] or None, None)} ({error}); "
                       "the rest is fetched row by row")
             yield from self._salvage(wanted, done, high)
 
@@ -72,7 +73,7 @@ class SqliteStorage(Storage):
                 self.left_out.append(f"{name} ({encoding})")
                 continue
             if name in self.topics and self.topics[name].msgtype != msgtype:
-                self.warn(f"topic {name} holds several types and is read as "
+                self.lose(f"topic {name} holds several types and is read as "
                           f"{self.topics[name].msgtype}")
                 continue
             self._numbers[number] = name
@@ -100,7 +101,7 @@ class SqliteStorage(Storage):
             if isinstance(first, int) and isinstance(last, int):
                 self.times = first, last
         except sqlite3.Error as error:
-            self.warn(f"{self.path.name}: damaged ({error}); what can be read is read row by row")
+            self.lose(f"{self.path.name}: damaged ({error}); what can be read is read row by row")
             stamps = []
             for _, number, stamp in self._rows_left():
                 if number in self._numbers:
@@ -135,7 +136,7 @@ class SqliteStorage(Storage):
             yield from (entry for entry in found if all(isinstance(v, int) for v in entry))
             row = found[-1][0] + 1
         if lost:
-            self.warn(f"{self.path.name}: rows are on damaged pages and lost")
+            self.lose(f"{self.path.name}: rows are on damaged pages and lost")
 
     def _salvage(self, wanted: dict[int, str], done: tuple[int, int], high: int) -> Iterator[Row]:
         left = sorted((stamp, row, number) for row, number, stamp in self._rows_left()
@@ -152,5 +153,5 @@ class SqliteStorage(Storage):
             else:
                 missing.append(stamp)
         if missing:
-            self.warn(f"{self.path.name}: {len(missing)} messages of "
+            self.lose(f"{self.path.name}: {len(missing)} messages of "
                       f"{span(missing[0], missing[-1])} cannot be read and are left out")

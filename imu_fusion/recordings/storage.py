@@ -47,12 +47,14 @@ class Storage:
     Attributes:
         topics: name to StoredTopic. times: (first, last) log time, None without messages.
         left_out: channels that are no topics of ROS 2, in words.
-        warn: called, while opening and while reading, with what is wrong or lost.
+        lose, mention: called, while opening and while reading, with what is lost, and with what
+            is wrong but costs no message.
     """
 
-    def __init__(self, path: Path, warn: Callable[[str], object]) -> None:
+    def __init__(self, path: Path, lose: Callable[[str], object],
+                 mention: Callable[[str], object]) -> None:
         self.path = path
-        self.warn = warn
+        self.lose, self.mention = lose, mention
         self.topics: dict[str, StoredTopic] = {}
         self.times: tuple[int, int] | None = None
         self.left_out: list[str] = []

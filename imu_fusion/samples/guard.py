@@ -28,7 +28,8 @@ JUMP = 1_000_000_000
 """Nanoseconds. Transport delays reorder samples by less, sensors pause for less."""
 
 OTHER_CLOCK = 7 * 86400 * 1_000_000_000
-"""Nanoseconds. No recording pauses for so long; computers that boot without a clock jump by more."""
+"""Nanoseconds. No recording pauses for so long; a computer that boots without a clock jumps by
+more."""
 
 _SLOW = 5          # usual intervals: what is ahead by no more is no jump, of slow sensors
 _AGREEING = 3      # samples in a row that make a clock that was set back
@@ -234,7 +235,7 @@ class Guard:
             return True
         stamps = self._together()[0][0]
         place = int(np.searchsorted(stamps, stamp))
-        return 0 < place and bool(
+        return place > 0 and bool(
             stamps[place] > stamp and stamps[place] - stamps[place - 1] > _HOLE * self._usual())
 
 
