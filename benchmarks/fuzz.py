@@ -215,6 +215,7 @@ def _timed_out(*_):
 
 def outcome(read: Callable[[Path], object], path: Path) -> str:
     """"read", "refused", or the place and kind of what went wrong."""
+    signal.signal(signal.SIGALRM, _timed_out)
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
         read(path)
@@ -276,7 +277,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path)
     arguments = parser.parse_args()
-    signal.signal(signal.SIGALRM, _timed_out)
     results = {}
     for kind in arguments.kinds or KINDS:
         results[kind] = run(kind, arguments.count, arguments.seed, arguments.keep)

@@ -62,7 +62,8 @@ class TimeParams(Parameters):
     column: str | None = param(None, doc="Column of the times; without one, give the rate.")
     unit: str = param("s", choices=tuple(TIME_UNITS), doc="Unit of the times.")
     start: float = param(
-        0.0, unit="s", low=0.0, high=float(_LATEST), doc="Added to the times. Give the Unix time of their zero.")
+        0.0, unit="s", low=0.0, high=float(_LATEST),
+        doc="Added to the times. Give the Unix time of their zero.")
     rate: float | None = param(
         None, unit="Hz", low=1e-3, doc="Rate of the rows, if the table has no times.")
 
@@ -266,12 +267,12 @@ def _read_table(source, params, columns):
         since = np.round(np.arange(len(rows)) * (NANOSECONDS / params.time.rate))
         return since.astype(np.int64) + round(params.time.start * NANOSECONDS), table
     place = names.index(params.time.column)
-    stamps = [_stamp(source, number, row, place, params) for number, row in rows]
-    if max(stamps) > _LATEST * NANOSECONDS:
+    times = [_stamp(source, number, row, place, params) for number, row in rows]
+    if max(times) > _LATEST * NANOSECONDS:
         raise SampleError(f"{source}: column '{params.time.column}' ends at "
-                          f"{max(stamps) / NANOSECONDS:g} s, which no stamp of ROS can hold (at "
+                          f"{max(times) / NANOSECONDS:g} s, which no stamp of ROS can hold (at "
                           f"most {_LATEST} s): is time.unit right?")
-    stamps = np.array(stamps, dtype=np.int64)
+    stamps = np.array(times, dtype=np.int64)
     if stamps.min() < 0:
         raise SampleError(f"{source}: column '{params.time.column}' begins at "
                           f"{stamps.min() * 1e-9:g} s; stamps cannot be negative: give time.start")

@@ -321,16 +321,17 @@ class McapStorage(Storage):
                        and tries.get(n, 0) < _TRIES]
             if block.counts and not unknown:
                 continue
+            counted = bool(block.counts)
             try:
                 data = self._unpacked(block)
             except DamageError as error:
                 self._lose_chunk(block, error)
-                if block.compression or not unknown:
+                if block.compression:
                     continue
+                counted = True
                 data = self._file.read(block.position, block.size)    # definitions may be sound
             for number in unknown:
                 tries[number] = tries.get(number, 0) + 1
-            counted = bool(block.counts)
             for opcode, content in _records(data):
                 if opcode in (_SCHEMA, _CHANNEL):
                     with contextlib.suppress(DamageError):

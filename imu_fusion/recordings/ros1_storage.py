@@ -10,7 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -74,6 +74,7 @@ class Ros1Storage(Storage):
         self._stores: dict[str, Typestore] = {}
         self._broken: dict[str, int] = {}
         self._holes: list[tuple[int, int]] = []    # (bytes, number of the chunk after)
+        self._lost = False    # a chunk, though its index may still be there
         try:
             if self._file.read(0, len(MAGIC)) != MAGIC:
                 raise BagError(f"{path}: not a ROS 1 bag of format 2.0 (it does not begin with "
@@ -116,6 +117,7 @@ class Ros1Storage(Storage):
                     start = chunk.position
                 found = self._find(start)
                 self._holes.append((found - position, len(self._chunks)))
+                self._lost = True
                 position = found
                 continue
             position = record[3]
@@ -145,9 +147,10 @@ class Ros1Storage(Storage):
             if chunk is None:
                 return False
             self._chunks.append(chunk)
+            self._lost = False
         elif op == bytes([_CONNECTION]):
             self._connect(header, self._file.read(content, min(size, _DEFINITIONS)))
-        elif op == bytes([_INDEX]) and self._chunks:
+        elif op == bytes([_INDEX]) and self._chunks and not self._lost:
             self._take_index(header, content, size)
         return len(op) == 1 and _MESSAGE <= op[0] <= _CONNECTION
 
@@ -212,9 +215,7 @@ class Ros1Storage(Storage):
                 continue
             if topic is None:
                 try:
-                    store = _store(connection)
-                    definition = (store.generate_msgdef(connection.msgtype, ros_version=2)[0],
-                                  store.hash_rihs01(connection.msgtype))
+                    store, definition = _types(connection.msgtype, connection.text)
                 except DamageError as error:
                     self.left_out.append(f"{connection.topic} ({connection.msgtype}: {error})")
                     continue
@@ -273,31 +274,42 @@ class Ros1Storage(Storage):
             yield time, connection.topic, cdr
 
 
-def _store(connection: _Connection) -> Typestore:
-    """Types as the bag itself defines them; those of Jazzy, where it does not."""
-    if not connection.text.strip() and connection.msgtype in TYPES.fielddefs:
-        return TYPES
+@lru_cache(maxsize=256)
+def _types(msgtype: str, text: str) -> tuple[Typestore, tuple[str, str]]:
+    """Types as the bag itself defines them, those of Jazzy where it does not; and (definition,
+    hash) of this one in ROS 2.
+
+    Raises:
+        DamageError: the definition cannot be read.
+    """
     try:
-        found = get_types_from_msg(connection.text, connection.msgtype)
-        # Code is made from names: they are checked here, and constants left out.
-        found = {name: ([], [(field, kind) for field, kind in fields if not (
-                    name == "std_msgs/msg/Header" and field == "seq")])
-                 for name, (_, fields) in found.items()}
-        for name, (_, fields) in found.items():
-            for word in (*name.split("/"), *(field for field, _ in fields)):
-                if not word.isidentifier() or keyword.iskeyword(word):
-                    raise DamageError(f"'{word[:40]}' in its definition is no name")
-        _refuse_recursion(found)
-        store = get_typestore(Stores.EMPTY)
-        store.register({"builtin_interfaces/msg/Time": TYPES.fielddefs[
-            "builtin_interfaces/msg/Time"], "builtin_interfaces/msg/Duration": TYPES.fielddefs[
-            "builtin_interfaces/msg/Duration"], **found})
-        store.get_msgdef(connection.msgtype)
-        return store
+        store = _store(msgtype, text)
+        return store, (store.generate_msgdef(msgtype, ros_version=2)[0],
+                       store.hash_rihs01(msgtype))
     except DamageError:
         raise
-    except Exception as error:
+    except Exception as error:    # whatever a parser makes of a hostile text
         raise DamageError(f"its definition cannot be read ({str(error)[:100]})") from None
+
+
+def _store(msgtype: str, text: str) -> Typestore:
+    if not text.strip() and msgtype in TYPES.fielddefs:
+        return TYPES
+    found = get_types_from_msg(text, msgtype)
+    # Code is made from names: they are checked here, and constants left out.
+    found = {name: ([], [(word, kind) for word, kind in fields if not (
+                name == "std_msgs/msg/Header" and word == "seq")])
+             for name, (_, fields) in found.items()}
+    for name, (_, fields) in found.items():
+        for word in (*name.split("/"), *(word for word, _ in fields)):
+            if not word.isidentifier() or keyword.iskeyword(word):
+                raise DamageError(f"'{word[:40]}' in its definition is no name")
+    _refuse_recursion(found)
+    store = get_typestore(Stores.EMPTY)
+    store.register({name: TYPES.fielddefs[name] for name in (
+        "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")} | found)
+    store.get_msgdef(msgtype)
+    return store
 
 
 def _refuse_recursion(types: dict) -> None:

@@ -16,6 +16,7 @@ from imu_fusion.recordings.storage import Row, Storage, StoredTopic, largest_chu
 _LARGEST_STAMP = 2**63 - 1
 _ROWS = 1000             # looked for at once
 _SMALLEST = 32           # bytes that a row takes at least: bounds the rows that may be missing
+_GIVE_UP = 2000          # rows in a row that cannot be read: the rest of the file is not there
 
 
 class SqliteStorage(Storage):
@@ -113,8 +114,8 @@ class SqliteStorage(Storage):
     def _rows_left(self) -> Iterator[tuple[int, int, int]]:
         """(row, topic, log time) of all rows that can be reached, in order of the rows."""
         size = self.path.stat().st_size
-        row, most, lost = 0, size // _SMALLEST, 0
-        while row <= most:
+        row, most, lost, in_a_row = 0, size // _SMALLEST, 0, 0
+        while row <= most and in_a_row < _GIVE_UP:
             try:
                 found = self._database.execute(
                     "select id, topic_id, timestamp from messages not indexed where id >= ? "
@@ -126,15 +127,19 @@ class SqliteStorage(Storage):
                         found += self._database.execute(
                             "select id, topic_id, timestamp from messages where id = ?",
                             (one,)).fetchall()
+                        in_a_row = 0
                     except (sqlite3.Error, OverflowError):
-                        lost += 1
+                        lost, in_a_row = lost + 1, in_a_row + 1
+                        if in_a_row >= _GIVE_UP:
+                            break
                 yield from (entry for entry in found if all(isinstance(v, int) for v in entry))
                 row += _ROWS
                 continue
             if not found:
                 break
             yield from (entry for entry in found if all(isinstance(v, int) for v in entry))
-            row = found[-1][0] + 1
+            # A damaged page may name any row, also those that have been.
+            row = max(found[-1][0] + 1, row + len(found))
         if lost:
             self.lose(f"{self.path.name}: rows are on damaged pages and lost")
 
