@@ -3,7 +3,7 @@
 Each kind of file that the package reads is mutated as disks, cables and people do it (bytes,
 lengths, pages of zeros, parts that are missing, repeated or moved, a cut end), and handed to what
 reads it. The only answer permitted beside a result is one of the package's own errors, within 10 s
-and 1 GB. What fails is kept in ``--keep DIR`` with its mutation; results go to
+of computing and 1 GB. What fails is kept in ``--keep DIR`` with its mutation; results go to
 benchmarks/results/fuzz.md.
 """
 
@@ -215,8 +215,8 @@ def _timed_out(*_):
 
 def outcome(read: Callable[[Path], object], path: Path) -> str:
     """"read", "refused", or the place and kind of what went wrong."""
-    signal.signal(signal.SIGALRM, _timed_out)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.signal(signal.SIGPROF, _timed_out)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         read(path)
         return "read"
@@ -228,7 +228,7 @@ def outcome(read: Callable[[Path], object], path: Path) -> str:
     except Exception as error:
         return f"FAILED {_where(error)}"
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def _where(error: BaseException) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import ImuFusionError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader, open_bag
@@ -47,13 +47,18 @@ class _Feed:
     def __init__(self, stage: Stage, report: StageReport, names: Mapping[str, str],
                  write: Write | None) -> None:
         self._stage, self._report, self._names, self._write = stage, report, names, write
-        self._recorded: dict[str, list] = {topic: [] for topic in names}
+        # An index may promise messages that are lost.
+        self._recorded: dict[str, list] = {topic: [(
+            np.empty(0, np.int64), np.empty((0, stage.inputs[topic].width)), [])]
+            for topic in names}
         self._stream = stage.stream(*report.params, warn=report.warnings.append)
         self._stream.concludes = True
         self._stream.reset(list(names))
 
     def take(self, block: Block) -> None:
         """Messages of the recording."""
+        if self._report.skipped:
+            return
         found = {}
         for topic, name in self._names.items():
             kind = self._stage.inputs[topic]
@@ -62,7 +67,12 @@ class _Feed:
                 found[topic] = decoded
                 self._recorded[topic].append((decoded.stamp, kind.values(decoded.values),
                                               decoded.frame_ids[:1]))
-        self._hand_on(self._stream.take_decoded(found))
+        try:
+            self._hand_on(self._stream.take_decoded(found))
+        except BagError:    # of the writer
+            raise
+        except ImuFusionError as error:    # the other stages go on
+            self._report.skipped = str(error)
 
     def finish(self) -> None:
         """The end of the recording: what is held back, and the report."""
@@ -72,17 +82,26 @@ class _Feed:
                     np.concatenate([v for _, v, _ in parts]),
                     next((f[0] for _, _, f in parts if f), ""))
                 for topic, parts in self._recorded.items()}
-        report.findings = list(self._stage.findings(logs))
         del self._recorded
         try:
+            report.findings = list(self._stage.findings(logs))
+            if report.skipped:
+                return
             self._hand_on(stream.finish())
             conclusion = stream.conclude()
             for made in conclusion.made if self._write else ():
                 self._hand_on(made)
             report.results, report.summary = dict(conclusion.results), conclusion.summary
             report.remarks, report.detail = list(conclusion.remarks), conclusion.detail
-        except ImuFusionError as error:    # the others go on
+        except BagError:    # of the writer
+            raise
+        except ImuFusionError as error:    # the other stages go on
             report.skipped = str(error)
+        finally:
+            self._count()
+
+    def _count(self) -> None:
+        report, stream = self._report, self._stream
         for topic in self._names:
             report.used[topic] = stream.guards[topic].counts[Verdict.OK]
             refused = stream.refused(topic)
