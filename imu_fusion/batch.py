@@ -131,7 +131,7 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
         with (BagWriter(out, overwrite=overwrite, whole=True) as writer,
               announced_compiling(progress)):
             def write(topic, msgtype, stamp, cdr):
-                writer.write("/" + topic, msgtype, cdr, stamp)
+                writer.write("/" + topic.lstrip("/"), msgtype, cdr, stamp)
 
             for stage, report, names in _run(reader, chosen, write):
                 progress(f"{stage.node}: " + ", ".join(

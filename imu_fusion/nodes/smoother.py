@@ -15,20 +15,21 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
+from imu_fusion.errors import EstimationError, ImuFusionError, ParameterError, TopicError
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.kernels import announced_compiling
+from imu_fusion.messages.transforms import TF_TYPE
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
-    OUTPUTS,
-    PER_SAMPLE,
+    ONCE,
     REQUIRED,
     SmootherNodeParams,
     SmootherStream,
     SmoothingParams,
+    outputs_of,
 )
 from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
@@ -40,6 +41,18 @@ _SLICE = 200  # messages published between callbacks
 
 def _latched(count):
     return reliable_qos(count, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def _class_of(msgtype):
+    """As message_class; where that of /tf is missing, the parameter that asks for it is named."""
+    try:
+        return message_class(msgtype)
+    except TopicError:
+        if msgtype != TF_TYPE:
+            raise
+        raise ParameterError("parameter 'publish_tf': true needs tf2_msgs, which is not here; with "
+                             "an apt ROS: apt install ros-jazzy-tf2-msgs, else set publish_tf "
+                             "false (imu_fusion process writes /tf without it)") from None
 
 
 def _smooth_in_child(connection, params, logs):
@@ -131,8 +144,8 @@ class SmootherNode(Node):
         surface_file = self.params(SmoothingParams).surface.file
         if surface_file:
             load_surface(surface_file)  # a bad file ends the node now
-        self._outputs = {topic: self._flow.output(message_class(msgtype), topic, _latched(1))
-                         for topic, msgtype in OUTPUTS.items()}
+        self._outputs = {topic: self._flow.output(_class_of(msgtype), topic, _latched(1))
+                         for topic, msgtype in outputs_of(self.params(SmoothingParams)).items()}
         self._child: Any = None
         self._answer: Any = None  # a Future: (whether it was smoothed, what is said of it)
         self._result = self._messages = None
@@ -233,9 +246,9 @@ class SmootherNode(Node):
             samples, outcome = self._result
             self._result = None
             for topic, output in self._outputs.items():
-                output.renew(_latched(len(samples) if topic in PER_SAMPLE else 1))
+                output.renew(_latched(1 if topic in ONCE else len(samples)))
             self._source.begin()
-            made = smoothing.messages(samples, outcome, self.params(SmoothingParams).path_rate)
+            made = smoothing.messages(samples, outcome, self.params(SmoothingParams))
             self._messages = itertools.chain.from_iterable(map(one_by_one, made))
         if self._messages is None:
             return False
