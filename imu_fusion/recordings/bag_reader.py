@@ -6,7 +6,6 @@ over what is damaged. The data files are what counts; metadata.yaml only says wh
 together, and where it contradicts them it is said and not believed.
 """
 
-import re
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -39,7 +38,6 @@ _PACKED = ".zstd"          # rosbag2's --compression-mode file
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message of its --compression-mode message; CDR never does
 _LARGEST_RATIO = 1000      # of a file and what it unpacks to
 _PIECE = 1 << 20
-_NAME = re.compile(r"[A-Za-z0-9_/~.:{}-]+")    # of topics and types; more than ROS permits
 
 
 @dataclass
@@ -240,7 +238,8 @@ class Reader:
     def _add(self, storage: Storage) -> None:
         """The topics of one more file."""
         for name, stored in storage.topics.items():
-            if not (_NAME.fullmatch(name) and _NAME.fullmatch(stored.msgtype)):
+            # Line breaks and escapes would speak to the terminal.
+            if not (name.isprintable() and stored.msgtype.isprintable()):
                 storage.left_out.append(f"{ascii(name)} ({ascii(stored.msgtype)})")
                 continue
             info = self.topics.get(name)

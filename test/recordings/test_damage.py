@@ -233,7 +233,7 @@ def test_other_encodings_are_named_and_not_called_damage(tmp_path):
     assert beside.exit_code == 0 and "left out: /log (protobuf)" in beside.output
 
 
-@pytest.mark.parametrize("name", ["", "/a\n/b", "/a\x1b[31m", "<script>", "/a b", "../a\\b"])
+@pytest.mark.parametrize("name", ["", "/a\n/b", "/a\x1b[31m", "/a\u202eb"])
 def test_names_that_are_none_are_not_shown_raw(tmp_path, name):
     file = mcap(tmp_path / "t.mcap", schema(IMU.msgtype), channel(name), message(imu(0)))
     result = through("info", file, None)
