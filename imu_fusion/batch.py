@@ -5,7 +5,7 @@ recording and parameters the estimates are those of the nodes, bit for bit.
 """
 
 import itertools
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,9 @@ from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.stage import Stage, StageReport
 from imu_fusion.streams.stream import Messages, one_by_one
 
+Write = Callable[[str, str, int, bytes], object]
+"""Takes topic, type, stamp in int ns and CDR bytes of a message."""
+
 Chosen = tuple[Stage, StageReport, Mapping[str, str]]
 """A stage that can run, its report, and its topics to those in the recording."""
 
@@ -33,15 +36,16 @@ Block = Mapping[tuple[str, Layout], Decoded]
 
 
 class _Feed:
-    """One estimator, from a recording into another one.
+    """One estimator, fed with a recording.
 
     Args:
         names: its topics to those in the recording.
+        write: what takes its messages; None: they are not made where that can be spared.
     """
 
     def __init__(self, stage: Stage, report: StageReport, names: Mapping[str, str],
-                 writer: BagWriter) -> None:
-        self._stage, self._report, self._names, self._writer = stage, report, names, writer
+                 write: Write | None) -> None:
+        self._stage, self._report, self._names, self._write = stage, report, names, write
         self._recorded: dict[str, list] = {topic: [] for topic in names}
         self._stream = stage.stream(*report.params, warn=report.warnings.append)
         self._stream.concludes = True
@@ -57,7 +61,7 @@ class _Feed:
                 found[topic] = decoded
                 self._recorded[topic].append((decoded.stamp, kind.values(decoded.values),
                                               decoded.frame_ids[:1]))
-        self._write(self._stream.take_decoded(found))
+        self._hand_on(self._stream.take_decoded(found))
 
     def finish(self) -> None:
         """The end of the recording: what is held back, and the report."""
@@ -70,12 +74,12 @@ class _Feed:
         report.findings = list(self._stage.findings(logs))
         del self._recorded
         try:
-            self._write(stream.finish())
+            self._hand_on(stream.finish())
             conclusion = stream.conclude()
-            for made in conclusion.made:
-                self._write(made)
+            for made in conclusion.made if self._write else ():
+                self._hand_on(made)
             report.results, report.summary = dict(conclusion.results), conclusion.summary
-            report.remarks = list(conclusion.remarks)
+            report.remarks, report.detail = list(conclusion.remarks), conclusion.detail
         except ImuFusionError as error:    # the others go on
             report.skipped = str(error)
         for topic in self._names:
@@ -84,9 +88,11 @@ class _Feed:
             if refused:
                 report.refused[topic] = refused
 
-    def _write(self, made: list[Messages]) -> None:
+    def _hand_on(self, made: list[Messages]) -> None:
+        if self._write is None:
+            return
         for topic, stamp, cdr in one_by_one(made):
-            self._writer.write("/" + topic, self._stage.outputs[topic], cdr, stamp)
+            self._write(topic, self._stage.outputs[topic], stamp, cdr)
             self._report.written[topic] += 1
 
 
@@ -120,29 +126,69 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
         if not chosen:
             raise TopicError("nothing to do: " + "; ".join(
                 f"{r.node}: {r.skipped}" for r in reports))
-        wanted = {(name, stage.inputs[topic].layout) for stage, _, names in chosen
-                  for topic, name in names.items()}
-        progress(f"reading {', '.join(sorted({name for name, _ in wanted}))} from "
-                 f"{Path(bag).name}")
+        topics = sorted({name for _, _, names in chosen for name in names.values()})
+        progress(f"reading {', '.join(topics)} from {Path(bag).name}")
         with (BagWriter(out, overwrite=overwrite, whole=True) as writer,
               announced_compiling(progress)):
-            feeds = [_Feed(*one, writer) for one in chosen]
-            for block in _blocks(reader, wanted):
-                for feed in feeds:
-                    feed.take(block)
-            warnings = list(reader.warnings)
-            for feed, (stage, report, names) in zip(feeds, chosen):
-                feed.finish()
+            def write(topic, msgtype, stamp, cdr):
+                writer.write("/" + topic.lstrip("/"), msgtype, cdr, stamp)
+
+            for stage, report, names in _run(reader, chosen, write):
                 progress(f"{stage.node}: " + ", ".join(
                     f"{report.used[topic]} {name}" for topic, name in names.items()))
                 if report.summary:
                     progress(f"{stage.node}: {report.summary}")
+            warnings = list(reader.warnings)
             write_results(writer.directory, {report.node: report.results for report in reports
                                              if report.results})
     warnings += [text for report in reports for text in report.findings]
     warnings += [f"{report.node}: {text}" for report in reports
                  for text in (*report.warnings, *report.remarks)]
     return reports, list(dict.fromkeys(warnings))
+
+
+def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | None = None,
+             keep: Collection[str] = ()) -> tuple[dict[str, StageReport], dict[str, list[bytes]]]:
+    """What some estimators say of a recording, without writing it.
+
+    Args:
+        bag: path of a recording.
+        nodes: node names of estimators; one whose topics are missing is skipped.
+        params_file: ROS 2 parameter file, or None for defaults.
+        keep: topics whose messages are wanted.
+
+    Returns:
+        (StageReports by node name, CDR bytes of the topics in ``keep`` in order)
+
+    Raises:
+        ImuFusionError: recording, parameters or topics are not usable.
+    """
+    kept: dict[str, list[bytes]] = {topic: [] for topic in keep}
+
+    def write(topic, msgtype, stamp, cdr):
+        if topic in kept:
+            kept[topic].append(cdr)
+
+    with open_bag(bag) as reader:
+        reports, chosen = _choose(reader, params_file, STAGES.keys() - set(nodes), {})
+        for _ in _run(reader, chosen, write, kept.keys()):
+            pass
+    return {report.node: report for report in reports}, kept
+
+
+def _run(reader: Reader, chosen: Sequence[Chosen], write: Write,
+         only: Collection[str] | None = None) -> Iterator[Chosen]:
+    """Feed a recording to stages; yield each when it has finished. ``only``: topics to write."""
+    feeds = [_Feed(*one, write if only is None or one[0].outputs.keys() & only else None)
+             for one in chosen]
+    wanted = {(name, stage.inputs[topic].layout) for stage, _, names in chosen
+              for topic, name in names.items()}
+    for block in _blocks(reader, wanted):
+        for feed in feeds:
+            feed.take(block)
+    for feed, one in zip(feeds, chosen):
+        feed.finish()
+        yield one
 
 
 def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageReport], list[Chosen]]:

@@ -195,10 +195,15 @@ def _directory(file: Path) -> Path | None:
     """Where the compiled functions of a file are, None if nowhere."""
     if not (file.exists() and file.is_relative_to(_PACKAGE)):
         return None    # typed in, or somebody else's
+    return cache_file(f"{file.stem}-{_version_of(file)[:24]}")
+
+
+@cache
+def _version_of(file: Path) -> str:
+    """A digest of all that the machine code of a file's kernels depends on."""
     sources = b"".join(str(f.relative_to(_PACKAGE.parent)).encode() + _digest(f)
                        for f in sorted(sources_of(file)))
-    digest = hashlib.sha256(versions().encode() + sources).hexdigest()
-    return cache_file(f"{file.stem}-{digest[:24]}")
+    return hashlib.sha256(versions().encode() + sources).hexdigest()
 
 
 def versions() -> str:

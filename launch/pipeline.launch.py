@@ -16,7 +16,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from imu_fusion.nodes.launching import after_compiling, check_arguments, on_success, shutdown
-from imu_fusion.nodes.pipeline import plan_pipeline
+from imu_fusion.nodes.pipeline import SMOOTHER, plan_pipeline
 from launch import LaunchDescription
 
 
@@ -31,12 +31,13 @@ def start(context):
                     parameters=[given.params_file, parameters])
 
     recorder = node("recorder", out=given.out, end_with_sources=True,
-                    expected_sources=["smoother"])
+                    expected_sources=[SMOOTHER])
     # ROS has no empty lists: what is empty is left to its default.
     replay = {name: list(value) if isinstance(value, tuple) else value
               for name, value in plan.replay_parameters(given.bag).items() if value != ()}
-    others = [node("smoothing_trigger"), node("replayer", **replay | {"rate": given.rate}),
-              *(node(name, qos="reliable") for name in plan.estimators)]
+    others = [node("replayer", **replay | {"rate": given.rate}),
+              *(node(name, qos="reliable", **({"smooth_at_end": True} if name == SMOOTHER else {}))
+                for name in plan.estimators)]
     # The recorder ends by itself when replay and smoother have said that nothing more comes.
     recorded = [shutdown("recording ended")]
     handlers = []

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import TopicError
 from imu_fusion.geometry.rotation_arrays import rotation_matrices, rpy_angles
@@ -266,7 +266,8 @@ def attitude_log(messages: Sequence[bytes]) -> AttitudeLog:
     known = (np.linalg.norm(quat, axis=1) > 0.5)[:, None]
     rotation = np.empty((0, 3, 3))
     if len(quat):
-        rotation = Rotation.from_quat(np.where(known, quat, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+        rotation = scipy.spatial.transform.Rotation.from_quat(
+            np.where(known, quat, [0.0, 0.0, 0.0, 1.0])).as_matrix()
     quat = np.where(known, quat, np.nan)
     samples = imu_values(values)
     return AttitudeLog(stamp, quat, rotation.transpose(0, 2, 1) @ cov_world @ rotation,

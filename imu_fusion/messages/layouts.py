@@ -293,6 +293,8 @@ FIX = Layout("sensor_msgs/msg/NavSatFix", before="bH", after="B", latitude=1, lo
              altitude=1, position_covariance=9)
 TWIST = Layout("geometry_msgs/msg/TwistWithCovarianceStamped", linear=3, angular=3, covariance=36)
 POSE = Layout("geometry_msgs/msg/PoseStamped", position=3, orientation=4)
+POSE_COVARIANCE = Layout("geometry_msgs/msg/PoseWithCovarianceStamped", position=3, orientation=4,
+                         covariance=36)
 ACCEL = Layout("geometry_msgs/msg/AccelWithCovarianceStamped", linear=3, angular=3, covariance=36)
 VECTOR3 = Layout("geometry_msgs/msg/Vector3Stamped", vector=3)
 ODOMETRY = Layout("nav_msgs/msg/Odometry", child=True, position=3, orientation=4,
@@ -302,4 +304,5 @@ ODOMETRY = Layout("nav_msgs/msg/Odometry", child=True, position=3, orientation=4
 BOOL_TYPE, STRING_TYPE = "std_msgs/msg/Bool", "std_msgs/msg/String"
 
 LAYOUTS = {layout.msgtype: layout
-           for layout in (IMU, MAG, FIX, TWIST, POSE, ACCEL, VECTOR3, ODOMETRY)}
+           for layout in (
+    IMU, MAG, FIX, TWIST, POSE, POSE_COVARIANCE, ACCEL, VECTOR3, ODOMETRY)}

@@ -30,7 +30,4 @@ NODES = {
         "called.", ("smooth", "clear")),
     "acceleration_field_estimator": Executable(
         "Acceleration field of a rigid body from accelerometers/<name> (and imu/data_raw).",
-        ("reset", "smooth")),
-    "smoothing_trigger": Executable(
-        "Wait for the end of a replay of imu/data_raw and fix, call smoother/smooth, tell the "
-        "answer.")}
+        ("reset", "smooth"))}

@@ -1,6 +1,6 @@
 """A recording through real ROS 2 nodes, smoothed and recorded: one call.
 
-    replayer -> smoother and other estimators -> recorder; smoothing_trigger calls smoother/smooth
+    replayer -> smoother and other estimators -> recorder
 
 Each node is a process of an own ROS domain. The estimates are those of ``batch.process``.
 """
@@ -41,7 +41,7 @@ class Plan:
         return {"bag": str(Path(bag).absolute()), "rate": 0.0, "exclude": self.outdated,
                 "remap": tuple(f"{name}:=/{topic}" for name, topic in self.renamed.items()),
                 "wait_for_subscribers": 0,
-                "wait_for_nodes": ("recorder", "smoothing_trigger", *self.estimators)}
+                "wait_for_nodes": ("recorder", *self.estimators)}
 
 
 def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
@@ -92,7 +92,7 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         remap: dict of topic names of ours to those in the recording.
         overwrite: replace ``out``.
         logs: directory for what the nodes print; a temporary one if None.
-        show: let replayer and smoothing trigger print here.
+        show: let replayer and smoother print here.
 
     Returns:
         ROS domain id that was used.
@@ -107,11 +107,11 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
                     overwrite=overwrite, end_with_sources=True, expected_sources=(SMOOTHER,))
         for node in plan.estimators:
-            nodes.start(node, params_file=file, qos="reliable")
-        nodes.start("smoothing_trigger", show=show, params_file=file)
+            own = {"smooth_at_end": True} if node == SMOOTHER else {}
+            nodes.start(node, show=show and node == SMOOTHER, params_file=file, qos="reliable",
+                        **own)
         nodes.start("replayer", show=show, params_file=file, **plan.replay_parameters(bag))
         nodes.wait("replayer", _PATIENCE)
-        nodes.wait("smoothing_trigger", _PATIENCE)
         nodes.wait("recorder", _PATIENCE)
         domain = nodes.domain
     with open_bag(out) as reader:

@@ -1,11 +1,14 @@
 """The replayer: a recording as live topics, its bytes undecoded, its stamps untouched."""
 
 import fnmatch
+import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -32,6 +35,9 @@ class ReplayerParams(Parameters):
     foreign_rate: float = param(
         1.0, doc="speed at rate 0 while nodes that are not ours subscribe: they drop what "
         "their queues cannot hold; 0: do not regard them", low=0)
+    seek: float | None = param(
+        None, doc="set while playing: jump there, counted from the start of the recording; "
+        "estimators start anew", unit="s", low=0, read_only=False)
     start_offset: float = param(0.0, doc="skip this much of the recording", unit="s", low=0)
     duration: float | None = param(None, doc="play this much of the recording", unit="s", low=0)
     loop: bool = param(False, doc="start again at the end")
@@ -81,6 +87,8 @@ class Replayer(Node):
         self._clock_out = self.create_publisher(
             Clock, "/clock", reliable_qos(10)) if p.clock else None
         self._next_clock = 0
+        self._from = self._start  # where the next session begins
+        self._seek: int | None = None  # where it is to begin as soon as this one has ended
         self._messages: Iterator[tuple[str, str, int, bytes]] = iter(())
         self._next = None  # (topic, log time, bytes) that is due next
         self._phase = self._wait
@@ -105,7 +113,23 @@ class Replayer(Node):
         if self._deadline is not None and time.monotonic() > self._deadline:
             self.finished = True
         self._flow.send()
+        if self._seek is not None:
+            self._jump(self._seek)
         return self._flow.pause(self._phase())
+
+    def apply(self, params: Mapping[type[Parameters], Parameters]) -> None:
+        """A new ``rate`` counts from the next message on; see :meth:`Node.apply`."""
+        seek = cast(ReplayerParams, params[ReplayerParams]).seek
+        if seek is None:
+            return
+        target, zero = self._bag.start_time + round(seek * 1e9), self._bag.start_time
+        if not self._start <= target < self._stop:
+            raise ParameterError(
+                f"parameter 'seek': {seek:g} s is not in what is played, "
+                f"{(self._start - zero) * 1e-9:g} to {(self._stop - zero) * 1e-9:g} s")
+        if self._deadline is not None or (self._phase == self._drain and self._last_event == END):
+            raise ParameterError("parameter 'seek': everything has been played; see loop")
+        self._seek = target
 
     def stop(self) -> None:
         """End the session, so that whoever listens knows; wait for that only briefly."""
@@ -150,6 +174,13 @@ class Replayer(Node):
                              + (", ".join(self._bag.topics) or "no topics"))
         return publishers
 
+    def _jump(self, log_time):
+        """End this session; the next one begins elsewhere."""
+        self._from, self._seek = log_time, None
+        self.set_parameters([Parameter("seek", value=math.nan)])  # can be set to the same again
+        if self._phase in (self._join, self._play):
+            self._end(NEXT)
+
     # Phases: each does a little and returns the seconds that may pass until its next call.
 
     def _wait(self):
@@ -166,7 +197,7 @@ class Replayer(Node):
     def _begin(self):
         # Asked to end after NEXT has been promised: the next session is empty.
         if self._deadline is None:
-            self._messages = self._bag.messages(list(self._outputs), self._start, self._stop)
+            self._messages = self._bag.messages(list(self._outputs), self._from, self._stop)
             self._advance()
         self._source.begin()
         self._anchor = None
@@ -191,6 +222,7 @@ class Replayer(Node):
         for _ in range(_BURST):
             if self._next is None:
                 again = self.params(ReplayerParams).loop and self._deadline is None
+                self._from = self._start
                 self._end(NEXT if again else END)
                 return 0.0
             if self._paused and not self._steps:

@@ -15,19 +15,21 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.errors import EstimationError, ImuFusionError, ParameterError, TopicError
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.kernels import announced_compiling
+from imu_fusion.messages.transforms import TF_TYPE
 from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
-from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
+from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
-    OUTPUTS,
-    PER_SAMPLE,
+    ONCE,
+    REQUIRED,
     SmootherNodeParams,
     SmootherStream,
     SmoothingParams,
+    outputs_of,
 )
 from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
@@ -39,6 +41,18 @@ _SLICE = 200  # messages published between callbacks
 
 def _latched(count):
     return reliable_qos(count, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def _class_of(msgtype):
+    """As message_class; where that of /tf is missing, the parameter that asks for it is named."""
+    try:
+        return message_class(msgtype)
+    except TopicError:
+        if msgtype != TF_TYPE:
+            raise
+        raise ParameterError("parameter 'publish_tf': true needs tf2_msgs, which is not here; with "
+                             "an apt ROS: apt install ros-jazzy-tf2-msgs, else set publish_tf "
+                             "false (imu_fusion process writes /tf without it)") from None
 
 
 def _smooth_in_child(connection, params, logs):
@@ -118,6 +132,7 @@ class SmootherNode(Node):
         p = self.params(SmootherNodeParams)
         self._stream = SmootherStream(self.params(SmoothingParams), p.memory_limit * 1e6,
                                       self.get_logger().warning)
+        self._at_end = p.smooth_at_end
         self._flow = Flow(self, on_begin=self._on_begin)
         self._source = self._flow.source
         self.problems = self._flow.problems
@@ -129,10 +144,11 @@ class SmootherNode(Node):
         surface_file = self.params(SmoothingParams).surface.file
         if surface_file:
             load_surface(surface_file)  # a bad file ends the node now
-        self._outputs = {topic: self._flow.output(message_class(msgtype), topic, _latched(1))
-                         for topic, msgtype in OUTPUTS.items()}
+        self._outputs = {topic: self._flow.output(_class_of(msgtype), topic, _latched(1))
+                         for topic, msgtype in outputs_of(self.params(SmoothingParams)).items()}
         self._child: Any = None
-        self._answer = self._result = self._messages = None
+        self._answer: Any = None  # a Future: (whether it was smoothed, what is said of it)
+        self._result = self._messages = None
         # Reentrant: a second call is answered while the first one still waits.
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
@@ -147,11 +163,13 @@ class SmootherNode(Node):
             self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
                                for topic, messages in turn.blocks.items()})
         self._flow.finish(turn)
-        if self._answer is not None:
+        if self._at_end and turn.event == END:
+            self._insist(self._replay_broke_off(turn.over) or self._start())
+        if self._child is not None:
             # The executor polls the coroutine of a waiting service without rest.
             time.sleep(_POLL)
-            if not self._answer.done() and self._child.poll():
-                self._answer.set_result(self._child.outcome)
+            if self._child.poll():
+                self._conclude()
             return 0.0
         return 0.0 if self._publish() else self._flow.pause(IDLE)
 
@@ -162,38 +180,59 @@ class SmootherNode(Node):
             self._child.close()
 
     def _on_begin(self, session):
-        if session.said.topics.keys() & self._names.keys():
+        played = {self._names.get(topic) for topic in session.said.topics} & INPUTS.keys()
+        if played:
             self._stream.reset()
+            missing = [topic for topic in REQUIRED if topic not in played]
+            if missing and self._at_end:
+                raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there "
+                                 "will be nothing to smooth")
+
+    @staticmethod
+    def _replay_broke_off(sessions):
+        broken = [session.source for session in sessions if session.broken]
+        return f"the replay of {', '.join(broken)} broke off" if broken else ""
+
+    def _insist(self, refusal):
+        if refusal:
+            raise EstimationError(f"not smoothed: {refusal}")
 
     async def _on_smooth(self, request, response):
-        response.success = False
-        if self._answer is not None:
-            response.message = "refused: smoothing is already running"
-            return response
+        response.message = self._start()
+        if not response.message:
+            response.success, response.message = await self._answer
+        return response
+
+    def _start(self):
+        """Have smoothed what was collected; returns why not, if not."""
+        if self._child is not None:
+            return "refused: smoothing is already running"
         if self._result is not None or self._messages is not None:
-            response.message = "refused: the last result is still being published"
-            return response
+            return "refused: the last result is still being published"
         try:
             logs = self._stream.logs()
         except ImuFusionError as error:
-            response.message = str(error)
-            return response
+            return str(error)
         counts = ", ".join(f"{len(log)} {topic}" for topic, log in logs.items())
         self.get_logger().info(f"smoothing {counts}")
         self._answer = Future()
         self._child = _Child(self.params(SmoothingParams), logs)
-        del logs
-        outcome = await self._answer
-        child, self._child, self._answer = self._child, None, None
+        return ""
+
+    def _conclude(self):
+        """The child has said all: answer."""
+        child, self._child = self._child, None
         child.close()
-        if isinstance(outcome, str):
-            response.message = outcome
-        else:
-            response.success = True
-            response.message = "; ".join([outcome.summary, *outcome.remarks])
-            self._result = child.samples, outcome
-        self.get_logger().info(response.message)
-        return response
+        if isinstance(child.outcome, str):
+            self._answer.set_result((False, child.outcome))
+            if self._at_end:
+                self._insist(child.outcome)
+            self.get_logger().info(child.outcome)
+            return
+        message = "; ".join([child.outcome.summary, *child.outcome.remarks])
+        self.get_logger().info(message)
+        self._answer.set_result((True, message))
+        self._result = child.samples, child.outcome
 
     def _publish(self):
         """Publish some of a result, as the subscribers take it; whether more could follow now.
@@ -207,9 +246,9 @@ class SmootherNode(Node):
             samples, outcome = self._result
             self._result = None
             for topic, output in self._outputs.items():
-                output.renew(_latched(len(samples) if topic in PER_SAMPLE else 1))
+                output.renew(_latched(1 if topic in ONCE else len(samples)))
             self._source.begin()
-            made = smoothing.messages(samples, outcome, self.params(SmoothingParams).path_rate)
+            made = smoothing.messages(samples, outcome, self.params(SmoothingParams))
             self._messages = itertools.chain.from_iterable(map(one_by_one, made))
         if self._messages is None:
             return False
@@ -238,7 +277,7 @@ class SmootherNode(Node):
         values |= {"megabytes": round(stream.bytes / 1e6, 1), "dropped": stream.dropped}
         if stream.dropped:
             return DiagnosticStatus.ERROR, "memory_limit reached, samples are dropped", values
-        if self._answer is not None:
+        if self._child is not None:
             return DiagnosticStatus.OK, "smoothing", values
         if self._result is not None or self._messages is not None:
             return DiagnosticStatus.OK, "publishing", values

@@ -1,20 +1,21 @@
 """Writing recordings: rosbag2 directories with MCAP.
 
-Goes through ``mcap``, which stores CRCs and keeps log and publish time apart.
+Log and publish time are kept apart, chunks carry CRCs.
 """
 
 import contextlib
 import os
 import shutil
+import struct
 from collections import Counter
 from pathlib import Path
 
-import mcap.writer
 import yaml
 from rosbags.typesys.store import Typestore
 
 from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
+from imu_fusion.recordings.mcap_writer import McapWriter
 from imu_fusion.recordings.qos import qos_profile
 from imu_fusion.recordings.targets import LIBRARY, METADATA_FILE, why_not_replaced
 
@@ -58,22 +59,15 @@ class BagWriter:
         self._typestore = typestore
         self._channels: dict[str, int] = {}
         self._topics: dict[str, dict] = {}
-        self._first: int | None = None
-        self._last: int | None = None
-        self._sequence: Counter[str] = Counter()
         self._prepare(overwrite)
         self._file = f"{self._target.name}_0.mcap"
         try:
             self._stream = open(self.directory / self._file, "wb")  # noqa: SIM115, closed by close
+            self._writer = McapWriter(self._stream, "ros2", LIBRARY, chunk_size, compression)
+            self._stream.flush()
         except OSError as error:
             self._restore()
             raise BagError(f"{self._target}: cannot be written ({error.strerror})") from None
-        self._position = 0
-        self._writer = mcap.writer.Writer(
-            self._stream, chunk_size=chunk_size,
-            compression=mcap.writer.CompressionType[compression.upper()])
-        self._writer.start(profile="ros2", library=LIBRARY)
-        self._flush()
 
     def _prepare(self, overwrite):
         target = self._target
@@ -155,8 +149,8 @@ class BagWriter:
             definition = (self._typestore.generate_msgdef(msgtype, ros_version=2)[0],
                           self._typestore.hash_rihs01(msgtype))
         text, digest = definition
-        schema = self._writer.register_schema(msgtype, "ros2msg", text.encode())
-        self._channels[topic] = self._writer.register_channel(
+        schema = self._writer.add_schema(msgtype, "ros2msg", text.encode())
+        self._channels[topic] = self._writer.add_channel(
             topic, "cdr", schema, {"offered_qos_profiles": yaml.dump(qos, Dumper=_Dumper),
                                    "topic_type_hash": digest})
         self._topics[topic] = {"name": topic, "type": msgtype, "serialization_format": "cdr",
@@ -183,24 +177,16 @@ class BagWriter:
             raise BagError(f"{self._target}: topic {topic} is {self._topics[topic]['type']}, "
                            f"not {msgtype}")
         try:
-            self._writer.add_message(self._channels[topic], log_time, bytes(cdr),
+            self._writer.add_message(self._channels[topic], self.counts[topic], log_time,
                                      log_time if publish_time is None else publish_time,
-                                     self._sequence[topic])
-            self._flush()
+                                     bytes(cdr))
         except OSError as error:
             raise BagError(f"{self._target}: writing failed ({error.strerror}); "
                            + self._what_stays()) from error
-        self._sequence[topic] += 1
+        except struct.error as error:
+            raise BagError(f"{self._target}: topic {topic}: a message at {log_time} ns cannot be "
+                           f"recorded: MCAP counts from 1970 on ({error})") from None
         self.counts[topic] += 1
-        self._first = log_time if self._first is None else min(self._first, log_time)
-        self._last = log_time if self._last is None else max(self._last, log_time)
-
-    def _flush(self):
-        # tell() moves only when the mcap writer has completed a chunk.
-        position = self._stream.tell()
-        if position != self._position:
-            self._stream.flush()
-            self._position = position
 
     def close(self) -> None:
         """Write index and metadata; safe to call twice.
@@ -210,12 +196,12 @@ class BagWriter:
         """
         if self._stream.closed:
             return
-        information = self._information()
         try:
+            self._writer.end_chunk()
+            information = self._information()
             # As rosbag2 does: the file alone tells what the directory would.
-            self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.dump(
+            self._writer.finish("rosbag2", {"serialized_metadata": yaml.dump(
                 information, Dumper=_Dumper, sort_keys=False)})
-            self._writer.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
             self._write_metadata(information)
@@ -242,8 +228,8 @@ class BagWriter:
 
     def _information(self):
         """What rosbag2 calls the bag's metadata."""
-        first = 0 if self._first is None else self._first
-        duration = 0 if self._last is None else self._last - first
+        first = self._writer.start_time or 0
+        duration = (self._writer.end_time or 0) - first
         total = sum(self.counts.values())
         times = {"starting_time": {"nanoseconds_since_epoch": first},
                  "duration": {"nanoseconds": duration}, "message_count": total}

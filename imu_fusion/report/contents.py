@@ -1,32 +1,34 @@
 """What a report needs of recordings: their logs, estimates and what was wrong with them."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import EstimationError, SampleError, TopicError
+from imu_fusion.batch import estimate
+from imu_fusion.errors import TopicError
 from imu_fusion.messages.convert import attitude_log, bool_value
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
 from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.inspect import TopicReport, inspect_topics
-from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.orientation_status import Status
 from imu_fusion.report.smoother import Smoothed
 from imu_fusion.samples import AttitudeLog
 from imu_fusion.samples.guard import guard_log
 from imu_fusion.samples.logs import Log
-from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
-from imu_fusion.streams.registry import STAGES
+from imu_fusion.streams.stage import StageReport
 from imu_fusion.surfaces.file import load_surface
 
 RAW, MAGNETOMETER, ESTIMATES = "imu/data_raw", "imu/mag", "imu/data"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
 REFERENCE, MOVING = "reference/pose", "reference/moving"
+ORIENTATION, SMOOTHER = "orientation_estimator", "smoother"
+
+_ESTIMATES = {ESTIMATES: IMU.msgtype, FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +56,6 @@ class Contents:
         """The log of a topic, or None."""
         return self.logs.get(topic) if topic else None
 
-    def samples(self, topics: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """dict of topic to (stamps, values), as a Stream uses them."""
-        return {topic: (self.logs[topic].stamp, self.logs[topic].flat())
-                for topic in topics if topic in self.logs and len(self.logs[topic])}
-
 
 def read_contents(path: str | Path) -> Contents:
     """Read a recording for a report.
@@ -83,56 +80,63 @@ def read_contents(path: str | Path) -> Contents:
                         reader.start_time, (reader.end_time - reader.start_time) * 1e-9)
 
 
-def read_estimates(path: str | Path) -> tuple[AttitudeLog | None, Status, list[str]]:
-    """(log of imu/data or None, Status, warnings) of a recording."""
-    warnings: list[str] = []
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What is drawn of an orientation: its log (None: there is none), Status, and texts on what
+    was left out."""
+
+    log: AttitudeLog | None
+    status: Status
+    warnings: list[str]
+
+
+def read_estimates(path: str | Path) -> Estimates:
+    """The Estimates in a recording."""
     with open_bag(path) as reader:
-        cdrs = {name: [cdr for _, _, _, cdr in reader.messages([reader.require(name).name])]
-                for name, msgtype in ((FLAGS_TOPIC, FLAGS_TYPE), (BIAS_TOPIC, TWIST.msgtype))
-                if _has(reader, name, msgtype)}
-        status = Status.from_messages(cdrs.get(FLAGS_TOPIC, ()), cdrs.get(BIAS_TOPIC, ()))
-        if not _has(reader, ESTIMATES, IMU.msgtype):
-            return None, status, warnings
-        log = _usable(read_log(reader, ESTIMATES, attitude_log), ESTIMATES, warnings)
-        return log, status, warnings
+        return _estimates({name: [cdr for *_, cdr in reader.messages([reader.require(name).name])]
+                           for name, msgtype in _ESTIMATES.items() if _has(reader, name, msgtype)})
 
 
-def estimate_orientation(contents: Contents, params_file: str | Path | None = None
-                         ) -> tuple[AttitudeLog | None, Status]:
-    """What the orientation estimator says of a recording's own samples; no log without
-    imu/data_raw."""
-    if RAW not in contents.logs:
-        return None, Status.from_messages((), ())
-    stage, params = STAGES["orientation_estimator"].prepare(params_file)
-    stream = stage.stream(*params)
-    stream.frame_ids = {topic: getattr(contents.logs[topic], "frame_id", "")
-                        for topic in stage.inputs
-                        if topic in contents.logs}
-    made = stream.use(contents.samples(stage.inputs)) + stream.flush()
-    cdrs = {topic: [cdr for part in made if part.topic == topic for cdr in part.cdrs]
-            for topic in (ESTIMATES, FLAGS_TOPIC, BIAS_TOPIC)}
-    return (attitude_log(cdrs[ESTIMATES]),
-            Status.from_messages(cdrs[FLAGS_TOPIC], cdrs[BIAS_TOPIC]))
+def make_estimates(bag: str | Path, params_file: str | Path | None, with_orientation: bool
+                   ) -> tuple[Estimates, StageReport]:
+    """What ``process`` would say of a recording: Estimates, and the smoother's StageReport.
 
-
-def smooth_recording(contents: Contents, params_file: str | Path | None = None
-                     ) -> tuple[Smoothed | None, str | None]:
-    """The smoothed trajectory of a recording.
-
-    Returns:
-        (Smoothed, None), or (None, why not in words); (None, None) without Imu or fixes.
+    Args:
+        bag: recording.
+        params_file: ROS 2 parameter file, or None for defaults.
+        with_orientation: whether the orientation is estimated, too.
     """
-    if not set(smoothing.REQUIRED) <= contents.logs.keys():
-        return None, None
-    _, (params,) = STAGES["smoother"].prepare(params_file)
-    try:
-        result = smoothing.smooth(params, {
-            topic: contents.logs[topic] for topic in smoothing.INPUTS if topic in contents.logs})
-    except (EstimationError, SampleError) as error:
-        return None, f"There is no smoothed trajectory: {error}"
+    nodes = [SMOOTHER, *([ORIENTATION] if with_orientation else [])]
+    reports, made = estimate(bag, nodes, params_file, keep=_ESTIMATES)
+    found = _estimates({topic: cdrs for topic, cdrs in made.items() if cdrs})
+    return replace(found, warnings=[
+        *(text for node in nodes for text in (*reports[node].warnings, *reports[node].remarks)),
+        *found.warnings]), reports[SMOOTHER]
+
+
+def smoothed_of(report: StageReport, origin: int) -> tuple[Smoothed | None, str | None]:
+    """(Smoothed, None) of the smoother's report, (None, why not in words) where smoothing failed,
+    (None, None) where there was nothing to smooth.
+
+    Args:
+        report: of the smoother. origin: int ns, zero of the time axes.
+    """
+    if report.detail is None:
+        return None, f"There is no smoothed trajectory: {report.skipped}" if report.used else None
+    result, logs = report.detail
+    (params,) = report.params
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoothed(result, params, surface, contents.log(FIX_TOPIC), contents.log(VELOCITY_TOPIC),
-                    int(contents.log(RAW).stamp[0])), None
+    return Smoothed(result, params, surface, logs[FIX_TOPIC], logs.get(VELOCITY_TOPIC),
+                    origin), None
+
+
+def _estimates(cdrs):
+    warnings: list[str] = []
+    log = None
+    if ESTIMATES in cdrs:
+        log = _usable(attitude_log(cdrs[ESTIMATES]), ESTIMATES, warnings)
+    status = Status.from_messages(cdrs.get(FLAGS_TOPIC, ()), cdrs.get(BIAS_TOPIC, ()))
+    return Estimates(log if log is not None and len(log) else None, status, warnings)
 
 
 def moving_changes(reader: Reader) -> tuple[np.ndarray, np.ndarray] | None:

@@ -22,10 +22,10 @@ from imu_fusion.report.contents import (
     REFERENCE,
     VELOCITY_TOPIC,
     Contents,
-    estimate_orientation,
+    make_estimates,
     read_contents,
     read_estimates,
-    smooth_recording,
+    smoothed_of,
 )
 from imu_fusion.report.field_data import FieldData, read_field
 from imu_fusion.report.figures import Shade, intervals
@@ -119,7 +119,7 @@ class _Material:
 
 def write_recording_report(bag: str | Path, estimates: str | Path | None, path: str | Path,
                            params_file: str | Path | None = None) -> Smoothed | None:
-    """Write the HTML report of a recording; its trajectory is smoothed anew for it.
+    """Write the HTML report of a recording; its trajectory is what ``process`` would make of it.
 
     Args:
         bag: recording with sensor topics and perhaps ``reference/pose``; another PoseStamped
@@ -150,17 +150,17 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
 def _gather(bag, estimates, params_file) -> _Material:
     contents = read_contents(bag)
     source = bag if estimates is None else estimates
-    estimate, status, warnings = read_estimates(source)
-    made_by = str(source)
-    if estimate is None and estimates is None:
-        estimate, status = estimate_orientation(contents, params_file)
-        made_by = "this report's own run"
-    smoothed, obstacle = smooth_recording(contents, params_file)
-    warnings = [*contents.warnings, *warnings]
-    if smoothed is not None:
-        warnings += smoothed.result.remarks()
-    return _Material(contents, made_by, estimate, status, smoothed, obstacle,
-                     read_field(bag, source, params_file), warnings)
+    recorded = read_estimates(source)
+    own = recorded.log is None and estimates is None
+    made, smoother = make_estimates(bag, params_file, with_orientation=own)
+    drawn = made if own else recorded
+    raw = contents.log(RAW)
+    smoothed, obstacle = smoothed_of(
+        smoother, int(raw.stamp[0]) if raw is not None and len(raw) else contents.start)
+    warnings = [*contents.warnings, *recorded.warnings, *made.warnings]
+    return _Material(contents, "this report's own run" if own else str(source), drawn.log,
+                     drawn.status, smoothed, obstacle, read_field(bag, source, params_file),
+                     list(dict.fromkeys(warnings)))
 
 
 def _summary(material) -> Section:

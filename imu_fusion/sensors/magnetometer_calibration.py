@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from imu_fusion.errors import CalibrationError
 
@@ -117,8 +117,9 @@ def _fit(m, estimate, radius):
         errors = residual(estimate, m)
         scatter = max(float(np.median(np.abs(errors))) / 0.6745, 1e-12)
         kept = m if loss == "soft_l1" else m[np.abs(errors) < 5.0 * scatter]
-        fit = least_squares(residual, estimate, args=(kept,), loss=loss, f_scale=scatter,
-                            x_scale="jac", xtol=1e-12, ftol=1e-12)
+        fit = scipy.optimize.least_squares(
+            residual, estimate, args=(kept,), loss=loss, f_scale=scatter, x_scale="jac",
+            xtol=1e-12, ftol=1e-12)
         estimate = fit.x
     return fit, kept
 
@@ -206,6 +207,11 @@ class MagCalibrator:
         self._count += 1
         return True
 
-    def result(self) -> MagCalibration:
-        """MagCalibration of what was kept so far. Raises CalibrationError as the batch fit."""
-        return calibrate_magnetometer(self._kept[:self._count], self._field_norm)
+    def result(self, limit: ArrayLike = np.inf) -> MagCalibration:
+        """MagCalibration of what was kept so far. Raises CalibrationError as the batch fit.
+
+        limit: tesla, scalar or (3,): samples with an axis at or beyond it are left out.
+        """
+        kept = self._kept[:self._count]
+        below = (np.abs(kept) < limit).all(axis=1)
+        return calibrate_magnetometer(kept[below], self._field_norm)

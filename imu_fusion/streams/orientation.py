@@ -9,6 +9,7 @@ import numpy as np
 
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.mag_screen import MagScreen
 from imu_fusion.estimation.orientation.rows import FLAG_STILL, ORIENTATION_DTYPE
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.geometry.rotation import quat_exp, quat_rotate
@@ -233,7 +234,7 @@ class OrientationStream(Stream):
                  warn: Callable[[str], object] = lambda text: None) -> None:
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
-        self._calibrator = MagCalibrator()
+        self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
         self._next_calibration: int | None = None
         super().__init__(INPUTS, warn)
 
@@ -301,7 +302,8 @@ class OrientationStream(Stream):
         Raises:
             CalibrationError: the samples do not determine it.
         """
-        calibration = self._calibrator.result()
+        # The first samples at a limit came before it was known.
+        calibration = self._calibrator.result(self._screen.limit)
         changes = calibration.to_parameters()
         if self.params.is_as_printed:
             del changes["fusion.mag_offset_sd"]    # the printed method knows no such thing
@@ -353,6 +355,8 @@ class OrientationStream(Stream):
 
     def _collect(self, stamps, values):
         """Samples for a calibration of the magnetometer, as often as they may be new."""
+        usable = ~self._screen.saturated(values)
+        stamps, values = stamps[usable], values[usable]
         k = 0
         while k < len(stamps):
             if self._next_calibration is not None and stamps[k] < self._next_calibration:

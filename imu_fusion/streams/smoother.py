@@ -7,21 +7,30 @@ end in :func:`smooth`, and so in the same messages.
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
-from imu_fusion.errors import EstimationError, MessageError
+from imu_fusion.errors import EstimationError, MessageError, ParameterError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_messages
 from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
-from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, ODOMETRY, TWIST
+from imu_fusion.messages.layouts import (
+    FIX,
+    IMU,
+    MAG,
+    NANOSECONDS,
+    ODOMETRY,
+    POSE_COVARIANCE,
+    TWIST,
+)
+from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE, transform_messages
 from imu_fusion.messages.typestore import TYPES
-from imu_fusion.parameters.declare import param
+from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import checks
 from imu_fusion.samples.blocks import Samples, joined
 from imu_fusion.streams.stage import Stage
@@ -35,12 +44,13 @@ INPUTS = {topic: SAMPLE_TYPES[layout.msgtype] for topic, layout in (
 REQUIRED = (IMU_TOPIC, FIX_TOPIC)
 
 ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
-SMOOTHED_FIX_TOPIC, PATH_TOPIC = "smoother/fix", "smoother/path"
-RESULTS_TOPIC = "smoother/results"
+SMOOTHED_FIX_TOPIC, POSE_TOPIC = "smoother/fix", "smoother/pose"
+PATH_TOPIC, RESULTS_TOPIC = "smoother/path", "smoother/results"
 PATH_TYPE = "nav_msgs/msg/Path"
 OUTPUTS = {ODOMETRY_TOPIC: ODOMETRY.msgtype, SMOOTHED_IMU_TOPIC: IMU.msgtype,
-           SMOOTHED_FIX_TOPIC: FIX.msgtype, PATH_TOPIC: PATH_TYPE, RESULTS_TOPIC: DIAGNOSTICS_TYPE}
-PER_SAMPLE = (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, SMOOTHED_FIX_TOPIC)
+           SMOOTHED_FIX_TOPIC: FIX.msgtype, POSE_TOPIC: POSE_COVARIANCE.msgtype,
+           PATH_TOPIC: PATH_TYPE, RESULTS_TOPIC: DIAGNOSTICS_TYPE}
+ONCE = (PATH_TOPIC, RESULTS_TOPIC)
 
 _NAME = "smoother"
 _SLICE = 1000  # samples whose messages are made at once
@@ -56,6 +66,26 @@ class SurfaceFile(SurfaceContact):
 
 
 @dataclass(frozen=True)
+class Frames(Parameters):
+    """``frame.*``: names in what is published; nothing is transformed by them."""
+
+    world: str = param("world", doc="East-north-up frame of the trajectory. Name it map, as REP "
+                       "105 has it, where a robot's frames hang below it.")
+    body: str | None = param(None, doc="Frame of the Imu; unset: the frame_id of its messages. "
+                             "Name it as your robot does where its driver does not.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, frame in (("world", self.world), ("body", self.body)):
+            if frame is not None and (not frame or frame.startswith("/")):
+                raise ParameterError(f"parameter 'frame.{name}': '{frame}' is no frame of tf2; "
+                                     "give a name without a leading slash")
+        if self.world == self.body:
+            raise ParameterError(f"parameter 'frame.body': '{self.body}' is the name of "
+                                 "frame.world, too; give them two names")
+
+
+@dataclass(frozen=True)
 class SmoothingParams(SmootherParams):
     """The smoother's parameters and what surrounds it."""
 
@@ -63,9 +93,13 @@ class SmoothingParams(SmootherParams):
                                               "surface": "surface.file"}
 
     surface: SurfaceFile = SurfaceFile()
+    frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
-                             doc="Rate of the poses of smoother/path. Lower it for long "
-                                 "recordings.")
+                             doc="Rate of smoother/pose and of the poses of smoother/path. Lower "
+                                 "it for long recordings.")
+    publish_tf: bool = param(
+        False, doc="Also write the trajectory to /tf, from frame.world to the frame of the Imu. "
+        "Not where another node publishes a parent of that frame. The node needs tf2_msgs.")
 
     def idle(self) -> dict[str, str]:
         idle = super().idle()
@@ -78,11 +112,19 @@ class SmoothingParams(SmootherParams):
 class SmootherNodeParams(EstimatorNodeParams):
     """What concerns the node, not the trajectory."""
 
+    smooth_at_end: bool = param(
+        False, doc="Smooth when a replay has ended, as if smoother/smooth were called. A refusal, "
+        "and a replay that plays not enough or breaks off, end the node with code 1.")
     memory_limit: float = param(1000.0, unit="MB", low=1.0, high=100000.0,
                                 doc="Collected samples may take this much; then no more are "
                                     "taken, and smoothing is refused until smoother/clear. Imu "
                                     "and magnetometer at 100 Hz take 32 MB an hour; smoothing "
                                     "takes more (docs/smoother.md).")
+
+
+def outputs_of(params: SmoothingParams) -> dict[str, str]:
+    """Topics and types of what is published under these parameters."""
+    return OUTPUTS | ({TF_TOPIC: TF_TYPE} if params.publish_tf else {})
 
 
 class SmootherStream(Stream):
@@ -155,12 +197,13 @@ class SmootherStream(Stream):
                 for topic, parts in self._collected.items() if parts}
 
     def conclude(self) -> Conclusion:
-        """What the samples of a whole recording make: the smoothed trajectory."""
+        """What the samples of a whole recording make: the smoothed trajectory; its detail is
+        (SmootherResult, logs by topic)."""
         logs = self.logs()
         result = smooth(self.params, logs)
         outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
-        return Conclusion(messages(result.samples, outcome, self.params.path_rate),
-                          outcome.numbers, outcome.summary, outcome.remarks)
+        return Conclusion(messages(result.samples, outcome, self.params),
+                          outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
 
 
 def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
@@ -208,10 +251,11 @@ class Outcome:
         """Texts on what makes the result doubtful."""
         return self.numbers["remarks"]
 
-    def message(self, stamp: int) -> bytes:
-        """CDR bytes of the diagnostic_msgs/DiagnosticArray on smoother/results; values are JSON."""
+    def message(self, stamp: int, world: str) -> bytes:
+        """CDR bytes of the diagnostic_msgs/DiagnosticArray on smoother/results; values are JSON.
+        world: frame id."""
         return diagnostics_message(
-            stamp, "world", _NAME, self.summary,
+            stamp, world, _NAME, self.summary,
             {key: json.dumps(value) for key, value in self.numbers.items()},
             bool(self.remarks), self.frame_id)
 
@@ -229,37 +273,53 @@ def results_value(cdr: bytes) -> dict[str, Any]:
         raise MessageError(f"{RESULTS_TOPIC}: a value cannot be read as JSON ({error})") from None
 
 
-def messages(samples: np.ndarray, outcome: Outcome, path_rate: float) -> Iterator[list[Messages]]:
+def messages(samples: np.ndarray, outcome: Outcome, params: SmoothingParams
+             ) -> Iterator[list[Messages]]:
     """Yield lists of Messages of a SmootherResult, in order of stamps, the path and the results
     last.
 
-    Odometry is in ``world`` (east-north-up at the result's frame) with the twist in the
+    Odometry is in the world (east-north-up at the result's frame) with the twist in the
     sensor's axes; its orientation covariance is about the fixed axes of the world.
 
     Args:
-        samples: structured array of a SmootherResult. outcome: Outcome. path_rate: Hz.
+        samples: structured array of a SmootherResult. outcome: Outcome. params: SmoothingParams,
+            of which names of frames, rate and topics are used.
     """
-    frame_id = outcome.frame_id
+    world, body = params.frame.world, params.frame.body or outcome.frame_id
+    shown = _shown(samples["stamp"], params.path_rate)
     for first in range(0, len(samples), _SLICE):
-        rows = samples[first:first + _SLICE]
+        rows, of_path = samples[first:first + _SLICE], shown[first:first + _SLICE]
         stamp = np.ascontiguousarray(rows["stamp"])
         odometry, imu, fix = _values(rows, outcome.frame)
-        yield [Messages(ODOMETRY_TOPIC, stamp,
-                        ODOMETRY.encode_block(stamp, "world", odometry, frame_id)),
-               Messages(SMOOTHED_IMU_TOPIC, stamp, IMU.encode_block(stamp, frame_id, imu)),
-               Messages(SMOOTHED_FIX_TOPIC, stamp, fix_messages(stamp, frame_id, fix))]
+        pose = odometry[of_path, :POSE_COVARIANCE.size]
+        made = [Messages(ODOMETRY_TOPIC, stamp,
+                         ODOMETRY.encode_block(stamp, world, odometry, body)),
+                Messages(SMOOTHED_IMU_TOPIC, stamp, IMU.encode_block(stamp, body, imu)),
+                Messages(SMOOTHED_FIX_TOPIC, stamp, fix_messages(stamp, body, fix)),
+                Messages(POSE_TOPIC, stamp[of_path],
+                         POSE_COVARIANCE.encode_block(stamp[of_path], world, pose))]
+        if params.publish_tf:
+            made.append(Messages(TF_TOPIC, stamp, transform_messages(
+                stamp, world, body, rows["position_world"], rows["quat_world_imu"])))
+        yield made
     if len(samples):
         last = int(samples["stamp"][-1])
         at = np.array([last])
-        yield [Messages(PATH_TOPIC, at, [_path(samples, path_rate)]),
-               Messages(RESULTS_TOPIC, at, [outcome.message(last)])]
+        yield [Messages(PATH_TOPIC, at, [_path(samples[shown], last, world)]),
+               Messages(RESULTS_TOPIC, at, [outcome.message(last, world)])]
+
+
+def _shown(stamp, rate):
+    """(n,) bool: samples at least 1 / rate apart, the first of each slot of that length."""
+    slots = (stamp - stamp[:1]) // round(1e9 / rate)
+    return np.diff(slots, prepend=-1) > 0
 
 
 def _values(rows, frame):
     """Values of the messages of samples: Odometry and Imu in the order of their layouts, latitude,
     longitude, height and covariance; (n, size) each."""
     n = len(rows)
-    rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    rotation = scipy.spatial.transform.Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
     back = rotation.transpose(0, 2, 1)
     vel_imu = np.einsum("nij,nj->ni", back, rows["vel_world"])
     cov_attitude = rotation @ rows["cov_attitude"] @ back
@@ -288,24 +348,22 @@ def _values(rows, frame):
     return odometry, imu, np.column_stack([place, rows["cov_position"].reshape(n, 9)])
 
 
-def _path(samples, rate):
-    """CDR bytes of a nav_msgs/Path with poses at least 1 / rate apart."""
+def _path(samples, stamp, world):
+    """CDR bytes of a nav_msgs/Path of samples."""
     types = TYPES.types
     header_type, time_type = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
 
     def header(stamp):
         sec, nanosec = divmod(int(stamp), NANOSECONDS)
-        return header_type(stamp=time_type(sec=sec, nanosec=nanosec), frame_id="world")
+        return header_type(stamp=time_type(sec=sec, nanosec=nanosec), frame_id=world)
 
-    slots = (samples["stamp"] - samples["stamp"][0]) // round(1e9 / rate)
-    first = np.flatnonzero(np.diff(slots, prepend=-1))
     poses = []
-    for row in samples[first]:
+    for row in samples:
         pose = types["geometry_msgs/msg/Pose"](
             position=types["geometry_msgs/msg/Point"](*map(float, row["position_world"])),
             orientation=types["geometry_msgs/msg/Quaternion"](*map(float, row["quat_world_imu"])))
         poses.append(types["geometry_msgs/msg/PoseStamped"](header=header(row["stamp"]), pose=pose))
-    path = types[PATH_TYPE](header=header(samples["stamp"][-1]), poses=poses)
+    path = types[PATH_TYPE](header=header(stamp), poses=poses)
     return bytes(TYPES.serialize_cdr(path, PATH_TYPE))
 
 
@@ -321,7 +379,7 @@ def _configure(stage, params_file):
     (params,) = stage.read_params(params_file)
     if params.surface.file:
         load_surface(params.surface.file)  # a bad file is refused before anything is read
-    return stage, [params]
+    return replace(stage, outputs=outputs_of(params)), [params]
 
 
 STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, REQUIRED, OUTPUTS,

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
@@ -76,7 +77,7 @@ class StageReport:
         written: topic to number of messages.
         skipped: why it did not run, empty if it did.
         summary: a line of text; ``results``: plain numbers of what it found; ``remarks``: texts on
-            what makes them doubtful.
+            what makes them doubtful; ``detail``: see Conclusion.
         findings: texts on what looks wrong with the samples; ``warnings``: on what the estimator
             met.
     """
@@ -90,5 +91,6 @@ class StageReport:
     summary: str = ""
     results: dict = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    detail: Any = None
     findings: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

@@ -43,13 +43,15 @@ class Conclusion:
     """What a stream says after the last sample of a whole recording.
 
     ``made``: further lists of Messages; ``results``: plain numbers; ``summary``: a line of text;
-    ``remarks``: texts on what makes the numbers doubtful.
+    ``remarks``: texts on what makes the numbers doubtful; ``detail``: what no message carries, for
+    those who want to draw it.
     """
 
     made: Iterable[list[Messages]] = ()
     results: Mapping[str, Any] = field(default_factory=dict)
     summary: str = ""
     remarks: Sequence[str] = ()
+    detail: Any = None
 
 
 def one_by_one(made: Iterable[Messages]) -> Iterator[tuple[str, int, bytes]]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.surfaces.constraint import DEFAULT_SIGMA, Constraint, Surface, split_sigma
@@ -127,9 +127,10 @@ class ElevationGrid(Surface):
                               "give the projected system of the file")
         self._check_own_system(pyproj, own, system, x.mean(), y.mean())
         missing = ~np.isfinite(heights)
-        spline = RectBivariateSpline(y, x, np.where(missing, heights[~missing].mean(), heights))
+        spline = scipy.interpolate.RectBivariateSpline(
+            y, x, np.where(missing, heights[~missing].mean(), heights))
         # The cubic patch of a cell reaches two nodes out: any hole there spoils it.
-        holes = RectBivariateSpline(y, x, missing.astype(float), kx=1, ky=1)
+        holes = scipy.interpolate.RectBivariateSpline(y, x, missing.astype(float), kx=1, ky=1)
         return x, y, spline, holes, transformer
 
     def _extent(self, x, y):

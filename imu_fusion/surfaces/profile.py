@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.integrate import quad
-from scipy.interpolate import PchipInterpolator
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.surfaces.values import number
@@ -170,8 +169,9 @@ class Profile:
     def arc_length(self, x0: float, x1: float) -> float:
         """Signed length of the curve from x0 to x1, m."""
         joints = self.knots[(self.knots > min(x0, x1)) & (self.knots < max(x0, x1))]
-        return quad(lambda x: float(np.hypot(1.0, self(x)[1])), x0, x1,
-                    points=joints if len(joints) else None, limit=200)[0]
+        return scipy.integrate.quad(
+            lambda x: float(np.hypot(1.0, self(x)[1])), x0, x1,
+            points=joints if len(joints) else None, limit=200)[0]
 
 
 def table_points(points: Any, where: str) -> np.ndarray:
@@ -209,7 +209,7 @@ def table_profile(points: Any, where: str) -> Profile:
         LayoutError: see :func:`table_points`.
     """
     points = table_points(points, where)
-    curve = PchipInterpolator(points[:, 0], points[:, 1])
+    curve = scipy.interpolate.PchipInterpolator(points[:, 0], points[:, 1])
     slope, curvature = curve.derivative(1), curve.derivative(2)
     (x0, z0), (x1, z1) = points[0], points[-1]
     return Profile([x0, x1], [Line(x0, z0, float(slope(x0))),

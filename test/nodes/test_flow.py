@@ -202,8 +202,8 @@ def test_a_promise_of_another_session_lasts_until_that_begins(graph):
     receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
     sender.session(10, event=NEXT)
     graph.until(lambda: receiver.ended and sender.source.drained())
-    sender.flow._say()
-    peer = receiver.flow.peers[sender.source._own]
+    sender.flow.peers.say()
+    peer = receiver.flow.peers[sender.flow.peers.own]
     graph.until(lambda: not peer.state.sending.session)
     assert receiver.flow.sink.promised()
     sender.session(10)
@@ -562,7 +562,7 @@ def test_forged_end_ends_nothing(graph, monkeypatch):
     receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
     sender.session(30_000)
     graph.until(lambda: len(receiver.values) > 100)
-    instance = sender.source._own
+    instance = sender.flow.peers.own
     forger = graph.node("forger")
     said = sender.source.sending()
     forger.create_publisher(DiagnosticArray, instance, STATE_QOS).publish(statement(
@@ -581,7 +581,7 @@ def test_two_that_say_who_they_are_are_given_up_after_a_while(graph, monkeypatch
     receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
     sender.session(100, event=None)
     graph.until(lambda: len(receiver.values) == 100)
-    instance = sender.source._own
+    instance = sender.flow.peers.own
     graph.node("forger").create_publisher(DiagnosticArray, instance, STATE_QOS)
     graph.until(lambda: receiver.ended)
     assert receiver.flow.problems == [
@@ -592,7 +592,7 @@ def test_two_that_say_who_they_are_are_given_up_after_a_while(graph, monkeypatch
 def test_the_state_of_another_is_said_by_its_own_writer(graph):
     sender, receiver = Sender(graph), Receiver(graph)
     graph.until(lambda: receiver.flow.peers and sender.flow.peers)
-    instance = sender.source._own
+    instance = sender.flow.peers.own
     info, = receiver.node.get_publishers_info_by_topic(instance)
     graph.until(lambda: receiver.flow.peers[instance].state is not None)
     assert receiver.flow.peers[instance].writer == gid(info)

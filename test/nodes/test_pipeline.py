@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from rclpy.parameter import Parameter
 
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError, TopicError
@@ -12,7 +13,6 @@ from imu_fusion.nodes.pipeline import run_pipeline
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
-from imu_fusion.nodes.smoothing_trigger import SmoothingTrigger
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
@@ -44,21 +44,20 @@ def assert_same(processed, recorded, topics):
 
 def start(graph, bag, out, expected=("smoother",)):
     recorder = graph.start(Recorder, out=str(out), expected_sources=list(expected))
-    graph.start(SmootherNode, qos="reliable")
-    node = graph.start(SmoothingTrigger)
+    smoother = graph.start(SmootherNode, qos="reliable", smooth_at_end=True)
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0, wait_for_subscribers=0,
-                           wait_for_nodes=["recorder", "smoother", "smoothing_trigger"])
-    return recorder, node, replayer
+                           wait_for_nodes=["recorder", "smoother"])
+    return recorder, smoother, replayer
 
 
 def test_recording_holds_all_of_the_smoother_as_batch_writes_it(graph, tmp_path):
     bag, out = write(tmp_path / "bag", 400), tmp_path / "out"
     reports, _ = batch.process(bag, tmp_path / "batch", without=["orientation_estimator"])
-    recorder, node, replayer = start(graph, bag, out)
+    recorder, _, replayer = start(graph, bag, out)
     graph.until(lambda: replayer.finished)
     assert not recorder.finished  # the smoother has not even begun
     graph.close(replayer)
-    graph.until(lambda: node.finished and recorder.finished, timeout=120.0)
+    graph.until(lambda: recorder.finished, timeout=120.0)
     graph.close(recorder)
     assert_same(tmp_path / "batch", out, ["/smoother/odometry", "/smoother/imu", "/smoother/fix",
                                           "/smoother/path", "/smoother/results"])
@@ -74,11 +73,20 @@ def test_a_refusal_of_the_smoother_is_an_error_with_its_reason(graph, tmp_path):
                          imu_message(stamp, "car", (0, 0, 0), (0, 0, 9.8)), stamp)
             writer.write("/fix", FIX.msgtype,
                          fix_message(stamp, "gnss", 47.0, 11.0, 600.0, status=-1), stamp)
-    _, node, replayer = start(graph, bag, tmp_path / "out")
+    _, _, replayer = start(graph, bag, tmp_path / "out")
     graph.until(lambda: replayer.finished)
     graph.close(replayer)
     with pytest.raises(EstimationError, match="not smoothed: no valid GNSS fix"):
-        graph.until(lambda: node.finished, timeout=120.0)
+        graph.until(lambda: False, timeout=120.0)
+
+
+def test_a_replay_that_breaks_off_is_not_smoothed(graph, tmp_path):
+    _, smoother, replayer = start(graph, write(tmp_path / "bag", 400), tmp_path / "out")
+    replayer.set_parameters([Parameter("rate", value=0.1)])
+    graph.until(lambda: smoother._stream.counts()["imu/data_raw"])
+    graph.remove(replayer)
+    with pytest.raises(EstimationError, match="not smoothed: the replay of /replayer broke off"):
+        graph.until(lambda: False)
 
 
 def test_a_replay_without_fixes_is_refused_when_it_begins(graph, tmp_path):

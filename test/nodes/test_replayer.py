@@ -1,5 +1,7 @@
 """The replayer: what it plays, at which pace, to whom, and how it is controlled."""
 
+import math
+
 import pytest
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
@@ -8,6 +10,7 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
 from imu_fusion.nodes.flow import END, NEXT
+from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
@@ -89,6 +92,50 @@ def test_loop_plays_again_in_a_session_of_its_own(graph, bag):
     graph.until(lambda: replayer.finished)
     assert sink.messages[IMU][:400] == stored(bag, IMU) * 2
     assert sink.ended[:2] == [NEXT, NEXT] and sink.ended[-1] == END
+
+
+def test_seek_begins_a_session_there(graph, bag):
+    """Backwards, to the same place again, and forwards; the pause lasts through it."""
+    sink, user = collector(graph), graph.node("user")
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0, start_paused=True, topics=[IMU])
+    all_of_it, seen = stored(bag, IMU), []
+    for seek, first in ((None, 0), (0.5, 50), (0.0, 0), (0.0, 0), (1.9, 190)):
+        if seek is not None:
+            assert replayer.set_parameters([Parameter("seek", value=seek)])[0].successful
+            graph.until(lambda n=len(seen): len(sink.ended) == n)
+        graph.until(lambda: graph.call(user, Trigger, "/replayer/step").success)
+        seen.append(all_of_it[first])
+        graph.until(lambda: sink.messages[IMU] == seen)
+    assert math.isnan(replayer.get_parameter("seek").value)
+    graph.call(user, Trigger, "/replayer/resume")
+    graph.until(lambda: replayer.finished)
+    assert sink.messages[IMU] == seen + all_of_it[191:]
+    assert sink.ended == [NEXT, NEXT, NEXT, NEXT, END]
+
+
+@pytest.mark.parametrize("seek, text", [(1.5, "not in what is played, 0.5 to 1 s"),
+                                        (0.0, "not in what is played"), (-2.0, "at least 0")])
+def test_seek_out_of_what_is_played_is_refused(graph, bag, seek, text):
+    replayer = graph.start(Replayer, bag=str(bag), start_offset=0.5, duration=0.5)
+    answer, = replayer.set_parameters([Parameter("seek", value=seek)])
+    assert not answer.successful and text in answer.reason
+
+
+def test_estimators_start_anew_where_a_seek_leads(graph, bag):
+    """Half of it, and then all: the same estimates again."""
+    sink = collector(graph, topics={"/imu/data": Imu})
+    graph.start(OrientationEstimatorNode)
+    replayer = graph.start(Replayer, bag=str(bag), rate=1.0,
+                           wait_for_nodes=["collector", "orientation_estimator"])
+    made = sink.messages["/imu/data"]
+    graph.until(lambda: len(made) > 100)
+    for parameter in (Parameter("seek", value=0.0), Parameter("rate", value=0.0)):
+        assert replayer.set_parameters([parameter])[0].successful
+    graph.until(lambda: replayer.finished and sink.ended[-1] == END)
+    again = made[-len(stored(bag, IMU)):]
+    before = made[:-len(again)]
+    assert 100 < len(before) < 200 and before == again[:len(before)]
+    assert sink.ended == [NEXT, END]
 
 
 def test_pause_step_and_resume(graph, bag):

@@ -1,15 +1,18 @@
 """The smoother node: collects, smooths in a child, answers, equals batch."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from imu_fusion import batch
-from imu_fusion.errors import EstimationError, LayoutError
+from imu_fusion.errors import EstimationError, LayoutError, ParameterError
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
 from imu_fusion.nodes.flow import END
@@ -21,7 +24,8 @@ from imu_fusion.streams.smoother import OUTPUTS, RESULTS_TOPIC, SmootherStream, 
 from test.nodes.conftest import START, STEP, collector
 
 TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix": NavSatFix,
-          "/smoother/path": Path, "/smoother/results": DiagnosticArray}
+          "/smoother/pose": PoseWithCovarianceStamped, "/smoother/path": Path,
+          "/smoother/results": DiagnosticArray}
 
 
 def write(path, count=600):
@@ -109,6 +113,13 @@ def test_who_comes_late_gets_all_of_the_last_result_and_nothing_else(graph, tmp_
     graph.until(lambda: sink.ended)
     assert len(sink.messages["/smoother/odometry"]) == 1500 and sink.ended == [END]
     assert not sink.flow.problems and not smoother.problems
+
+
+def test_transforms_without_tf2_are_refused_with_the_parameter_s_name(graph):
+    if importlib.util.find_spec("tf2_msgs"):
+        pytest.skip("tf2_msgs is installed here")
+    with pytest.raises(ParameterError, match="publish_tf.*tf2_msgs"):
+        graph.start(SmootherNode, publish_tf=True)
 
 
 def test_a_bad_surface_ends_the_node_at_its_start(graph):

@@ -17,9 +17,10 @@ from imu_fusion.estimation.smoother import SmootherParams
 from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report import smoother as report
-from imu_fusion.report.contents import read_contents, smooth_recording
+from imu_fusion.report.contents import make_estimates, smoothed_of
 from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.smoother import Smoothed, interpolate, smoother_sections
@@ -32,7 +33,8 @@ BAG, PARAMS = ROOT / "bags" / "jump_simulated", ROOT / "config" / "jump_simulate
 
 @pytest.fixture(scope="module")
 def smoothed():
-    found, reason = smooth_recording(read_contents(BAG), PARAMS)
+    _, report = make_estimates(BAG, PARAMS, with_orientation=False)
+    found, reason = smoothed_of(report, int(report.detail[1]["imu/data_raw"].stamp[0]))
     assert reason is None
     return found
 
@@ -160,10 +162,13 @@ def test_report_from_the_command_line_is_bounded_and_refusals_are_told(tmp_path)
 
 def test_what_cannot_be_smoothed_is_told_in_the_report(tmp_path):
     """A hill needs take-off and touch-down, and these need velocities."""
-    contents = read_contents(BAG)
-    logs = {name: log for name, log in contents.logs.items() if name != "fix_velocity"}
-    found, reason = smooth_recording(replace(contents, logs=logs), PARAMS)
-    assert found is None and "no smoothed trajectory: take-off and touch-down" in reason
+    with open_bag(BAG) as reader, BagWriter(tmp_path / "bag") as writer:
+        for topic, msgtype, stamp, cdr in reader.messages():
+            if topic != "/fix_velocity":
+                writer.write(topic, msgtype, cdr, stamp)
+    write_recording_report(tmp_path / "bag", None, tmp_path / "r.html", PARAMS)
+    text = Page((tmp_path / "r.html").read_text()).text
+    assert "no smoothed trajectory: take-off and touch-down" in text
 
 
 @pytest.mark.slow

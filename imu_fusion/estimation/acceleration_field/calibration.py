@@ -9,9 +9,8 @@ as given.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
-from scipy.linalg import orthogonal_procrustes
-from scipy.optimize import least_squares
 
 from imu_fusion.errors import CalibrationError
 
@@ -60,7 +59,7 @@ def calibrate_array(poses: ArrayLike, gravity: float = 9.80665) -> ArrayCalibrat
         felt = (poses[:, k] - bias) @ matrix.T
         if first is None:
             first = felt
-        turn, _ = orthogonal_procrustes(felt, first)
+        turn, _ = scipy.linalg.orthogonal_procrustes(felt, first)
         matrices.append(turn.T @ matrix)
         biases.append(bias)
         residuals.append(residual)
@@ -81,8 +80,8 @@ def _calibrate_one(poses, gravity, number):
         return np.linalg.norm((poses - p[6:]) @ matrix_of(p).T, axis=1) - gravity
 
     # A pose that was not quite still must not bend the fit: linear loss beyond 0.3 % of gravity.
-    found = least_squares(residual, np.r_[1, 0, 0, 1, 0, 1, 0, 0, 0], loss="soft_l1",
-                          f_scale=3e-3 * gravity)
+    found = scipy.optimize.least_squares(
+        residual, np.r_[1, 0, 0, 1, 0, 1, 0, 0, 0], loss="soft_l1", f_scale=3e-3 * gravity)
     condition = np.linalg.cond(found.jac / np.linalg.norm(found.jac, axis=0))
     if condition > 1e3:
         raise CalibrationError(f"accelerometer {number}: the still poses do not determine scale "

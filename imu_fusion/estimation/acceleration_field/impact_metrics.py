@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
-from scipy.integrate import cumulative_trapezoid
-from scipy.signal import StateSpace, butter, lsim, sosfiltfilt
 
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.acceleration_field.rows import GAP, MISSING, SATURATED, field_at
@@ -74,7 +73,8 @@ def channel_filter(values: ArrayLike, rate: float, channel_class: int) -> np.nda
                           f"{10 * channel_class} Hz)")
     values = np.asarray(values, dtype=float)
     pad = min(len(values) - 1, max(6, int(np.ceil(0.01 * rate))))
-    return sosfiltfilt(butter(2, corner, fs=rate, output="sos"), values, axis=0, padlen=pad)
+    sections = scipy.signal.butter(2, corner, fs=rate, output="sos")
+    return scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=pad)
 
 
 def hic(t: np.ndarray, acceleration: np.ndarray, longest: float) -> tuple[
@@ -89,7 +89,7 @@ def hic(t: np.ndarray, acceleration: np.ndarray, longest: float) -> tuple[
     Returns:
         (value, t1, t2)
     """
-    impulse = cumulative_trapezoid(acceleration / STANDARD_GRAVITY, t, initial=0.0)
+    impulse = scipy.integrate.cumulative_trapezoid(acceleration / STANDARD_GRAVITY, t, initial=0.0)
     best = (0.0, t[0], t[0])
     for lag in range(1, len(t)):
         span = t[lag:] - t[:-lag]
@@ -168,11 +168,12 @@ def damage(t: np.ndarray, alpha: np.ndarray) -> float:
     """
     kxx, kyy, kzz, kxz = 32142.0, 23493.0, 16935.0, 1636.3
     stiffness = np.array([[kxx + kxz, 0, -kxz], [0, kyy, 0], [-kxz, 0, kxz + kzz]])
-    system = StateSpace(
+    system = scipy.signal.StateSpace(
         np.block([[np.zeros((3, 3)), np.eye(3)], [-stiffness, -5.9148e-3 * stiffness]]),
         np.vstack([np.zeros((3, 3)), np.eye(3)]), np.hstack([np.eye(3), np.zeros((3, 3))]),
         np.zeros((3, 3)))
-    _, deflection, _ = lsim(system, alpha, np.arange(len(t)) * (t[-1] - t[0]) / (len(t) - 1))
+    even = np.arange(len(t)) * (t[-1] - t[0]) / (len(t) - 1)
+    _, deflection, _ = scipy.signal.lsim(system, alpha, even)
     return float(2.9903 * np.linalg.norm(deflection, axis=1).max())
 
 

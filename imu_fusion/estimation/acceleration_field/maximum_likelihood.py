@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.acceleration_field.measurement import make_trace
@@ -64,9 +64,9 @@ def fit_densities(params: AccelerationFieldParams, array: SensorArray,
 
     # Five per cent in the densities changes no estimate noticeably; half a unit of log
     # likelihood is half a standard deviation of a parameter.
-    found = minimize(cost, first, method="Nelder-Mead",
-                     options={"xatol": 0.05, "fatol": 0.5,
-                              "initial_simplex": np.vstack([first, first + np.eye(len(first))])})
+    found = scipy.optimize.minimize(cost, first, method="Nelder-Mead", options={
+        "xatol": 0.05, "fatol": 0.5,
+        "initial_simplex": np.vstack([first, first + np.eye(len(first))])})
     if not np.isfinite(found.fun):
         raise EstimationError("maximum likelihood: no finite likelihood; check the units of the "
                               "readings and of the noise densities")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.acceleration_field.motion_model import (
     ACC,
@@ -85,7 +85,8 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
         cov[THETA:OMEGA, THETA:OMEGA] = np.eye(3) - np.outer(up, up)
         constraint[:, THETA:OMEGA] = -skew(target)
     x, cov = _update(x, cov, constraint, target, np.eye(3) * _STILL_SD ** 2)
-    quat = (Rotation.from_quat(quat) * Rotation.from_rotvec(parts(x).theta)).as_quat()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(parts(x).theta)
+    quat = (scipy.spatial.transform.Rotation.from_quat(quat) * turn).as_quat()
     parts(x).theta[:] = 0.0
     return Start(x, cov, quat)
 
@@ -112,13 +113,13 @@ def normalized(quat: Sequence[float]) -> np.ndarray:
 
 def _level(up, quat):
     """The orientation nearest to ``quat`` in which the body direction ``up`` points up."""
-    pointing = Rotation.from_quat(quat).apply(up)
+    pointing = scipy.spatial.transform.Rotation.from_quat(quat).apply(up)
     axis = np.cross(pointing, [0.0, 0.0, 1.0])
     sine = np.linalg.norm(axis)
     # Upside down, every horizontal axis is as near as any other.
     axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
-    turn = Rotation.from_rotvec(axis * np.arctan2(sine, pointing[2]))
-    return (turn * Rotation.from_quat(quat)).as_quat()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(axis * np.arctan2(sine, pointing[2]))
+    return (turn * scipy.spatial.transform.Rotation.from_quat(quat)).as_quat()
 
 
 def _update(x, cov, rows, reading, noise):

@@ -21,7 +21,7 @@ _NO_FIELD = 1e-9           # T: zeros of a magnetometer that is not there; rooms
 _REPEATS_AT_LIMIT = 4      # equal largest values that make a flat top
 _STEPS = 4.0               # see above
 _EARTH_FIELD = 70e-6       # T: a range below the Earth's field (up to 67 uT) is not searched for
-_TOLERANCE = 1e-3          # the two ends of a range differ by a step, but by no more than this
+TOLERANCE = 1e-3          # the two ends of a range differ by a step, but by no more than this
 
 
 @njit
@@ -82,7 +82,7 @@ def is_saturated(found, ranges, mag):
         found.largest[i] = max(found.largest[i], size)
         limit = found.limit[i]
         if limit > 0.0:
-            slack = min(1.5 * found.step[i], _TOLERANCE * limit)
+            slack = min(1.5 * found.step[i], TOLERANCE * limit)
             if size > limit + slack:
                 found.limit[i] = 0.0
             elif size >= limit - slack:

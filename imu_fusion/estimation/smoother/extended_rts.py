@@ -12,7 +12,7 @@ the pass back filters each segment once more; the operations are the same and so
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.extended_rts_model import (
@@ -194,10 +194,10 @@ def _first_state(model, data, quat_world_imu):
     if quat_world_imu is None:
         quat_world_imu = attitude_from_vectors(data.inputs[0, 3:], mag,
                                                ENU_NED @ model.field_ned)
-    attitude = ENU_NED @ Rotation.from_quat(quat_world_imu).as_matrix()
+    attitude = ENU_NED @ scipy.spatial.transform.Rotation.from_quat(quat_world_imu).as_matrix()
     x = np.zeros(SIZE)
     x[R], x[V] = fix, attitude.T @ velocity
-    x[Q] = np.roll(Rotation.from_matrix(attitude).as_quat(), 1)
+    x[Q] = np.roll(scipy.spatial.transform.Rotation.from_matrix(attitude).as_quat(), 1)
     return x
 
 
@@ -306,7 +306,8 @@ def _samples(model, stamp, inputs, x, cov, sd):
     samples["stamp"] = stamp
     samples["position_world"] = x[:, R] @ model.axes
     samples["cov_position"] = model.axes.T @ cov[:, R, R] @ model.axes
-    attitude = Rotation.from_matrix(ENU_NED) * Rotation.from_quat(np.roll(x[:, Q], -1, axis=1))
+    turn = scipy.spatial.transform.Rotation.from_matrix(ENU_NED)
+    attitude = turn * scipy.spatial.transform.Rotation.from_quat(np.roll(x[:, Q], -1, axis=1))
     samples["vel_world"] = attitude.apply(x[:, V])
     samples["quat_world_imu"] = attitude.as_quat()
     for sample, xk, ck in zip(samples, x, cov):

@@ -1,7 +1,7 @@
 """The first state: attitude from gravity and the magnetic field, or from a search."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.measurements.registry import FIX, MAG, VELOCITY
@@ -42,14 +42,14 @@ def attitude_from_vectors(acc: np.ndarray, mag: np.ndarray | None, field_world: 
     side = side / np.linalg.norm(side)
     body = np.stack([side, np.cross(up, side), up])
     world = np.stack([world_side, np.cross([0.0, 0.0, 1.0], world_side), [0.0, 0.0, 1.0]])
-    return Rotation.from_matrix(world.T @ body).as_quat()
+    return scipy.spatial.transform.Rotation.from_matrix(world.T @ body).as_quat()
 
 
 def headings(quat: np.ndarray, count: int) -> np.ndarray:
     """``count`` attitudes (count, 4): ``quat`` turned about the vertical in equal steps."""
     angles = 2.0 * np.pi * np.arange(count)[:, None] / count
-    turns = Rotation.from_rotvec(angles * [0.0, 0.0, 1.0])
-    return (turns * Rotation.from_quat(quat)).as_quat()
+    turns = scipy.spatial.transform.Rotation.from_rotvec(angles * [0.0, 0.0, 1.0])
+    return (turns * scipy.spatial.transform.Rotation.from_quat(quat)).as_quat()
 
 
 def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarray | None

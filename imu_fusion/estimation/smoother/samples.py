@@ -1,7 +1,7 @@
 """From a solved problem to what is published of each sample: corrected readings among it."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.smoother.problem import Change, Problem
 from imu_fusion.estimation.smoother.result import SAMPLE, reading_variances
@@ -94,7 +94,8 @@ def _recover_clipped(samples: np.ndarray, problem: Problem) -> None:
         return
     row = np.cumsum(problem.imu.recorded) - 1   # of a sample in ``samples``
     span = ((log.stamp[inner + 1] - log.stamp[inner - 1]) * 1e-9)[:, None]
-    attitude, velocity = Rotation.from_quat(x[:, ATT:ATT + 4]), x[:, VEL:VEL + 3]
+    attitude = scipy.spatial.transform.Rotation.from_quat(x[:, ATT:ATT + 4])
+    velocity = x[:, VEL:VEL + 3]
     rate = (attitude[inner - 1].inv() * attitude[inner + 1]).as_rotvec() / span
     rate += attitude[inner].inv().apply(around.earth_rate)
     fall = np.array([gravity_world(at, around.gravity) for at in x[inner, POS:POS + 3]])

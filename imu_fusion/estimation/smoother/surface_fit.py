@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
@@ -61,7 +61,7 @@ def at_surface(samples: np.ndarray, states: dict[str, tuple[np.ndarray, np.ndarr
     lever = np.broadcast_to(lever, samples["position_world"].shape)
     lever_cov = np.broadcast_to(lever_sd, lever.shape)[:, None] ** 2 * np.eye(3)
     gyr_cov = samples["gyr_sd"][:, None] ** 2 * np.eye(3)
-    turn = Rotation.from_quat(samples["quat_world_imu"]).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"]).as_matrix()
     swing = np.cross(samples["gyr"], lever)
 
     def crossed(v):

@@ -16,7 +16,8 @@ processes the session of somebody else). What makes it lossless:
    answered with the readers that it has made, and these are matched. Who comes later is added to
    the list: sending stops, the counts are stated, the newcomer answers. A node between takes
    nothing before its own session may send, and lists also those whom its sender knows (discovery
-   between each two nodes takes its own time); so readiness passes along the chain.
+   between each two nodes takes its own time); so readiness passes along the chain. Who waits for
+   no names begins when nobody new has been seen for a second.
 4. **The end** is stated, with the counts, when all is acknowledged: then it is in the queue of
    each reader, which takes what there is, compares, finishes, and says so. The sender stays until
    all have. More or less than the count, a sender that broke off, a joined one that vanished: a

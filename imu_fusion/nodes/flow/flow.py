@@ -1,21 +1,17 @@
 """A node's part in sessions, as taker, sender or both: :class:`Flow`."""
 
-import time
-import uuid
 from collections.abc import Callable, Collection
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from imu_fusion.nodes.flow.peers import Peers
-from imu_fusion.nodes.flow.qos import PARTICIPANT, SILENT, made, steady_timer
+from imu_fusion.nodes.flow.qos import steady_timer
 from imu_fusion.nodes.flow.sink import Input, Session, Sink, Turn
-from imu_fusion.nodes.flow.source import AT_ONCE, Output, Source
-from imu_fusion.nodes.flow.state import END, MARK, STATE_QOS, State
+from imu_fusion.nodes.flow.source import Output, Source
+from imu_fusion.nodes.flow.state import END, State
 
 _LOOK_EVERY = 0.1  # s
-_LAST_WORDS = 0.5  # s
 _POLL, _POLL_AT_MOST = 0.002, 0.016  # s, between looks whether all is acknowledged
 
 
@@ -43,25 +39,15 @@ class Flow:
     def __init__(self, node: Node, *, listens: bool = True, relays: bool = False,
                  wait_for: Collection[str] = (), hold: Callable[[], bool] = lambda: False,
                  on_begin: Callable[[Session], None] = lambda session: None) -> None:
-        self.problems: list[str] = []  # texts: why the exit code is 1
-        self._node, self._listens, self._relays = node, listens, relays
-        own = f"{node.get_fully_qualified_name()}{MARK}i{uuid.uuid4().hex[:12]}"
-        self._publisher, gid = made(node.get_publishers_info_by_topic, own, lambda: (
-            node.create_publisher(DiagnosticArray, own, STATE_QOS, event_callbacks=SILENT)))
-        self.peers = Peers(node, own, self._changed, self._problem)
-        self.source = Source(
-            node, self.peers, own, gid[:PARTICIPANT], wait_for=wait_for, say=self._say,
-            upstream=lambda: self.sink.company() if relays else set(), problem=self._problem)
-        self.sink = Sink(
-            node, self.peers, own, gid[:PARTICIPANT], hold=hold, on_begin=on_begin,
-            on_join=self._join, gate=lambda: not relays or self.source.ready(),
-            may_answer=lambda: not relays or (
-                self.source.is_settled() and self.sink.company() <= self.source.company),
-            say=self._say,
-            problem=self._problem)
-        self._said: State | None = None
+        self._listens, self._relays = listens, relays
+        self.peers = Peers(node, self._state, self._changed)
+        self.problems = self.peers.problems
+        self.source = Source(self.peers, wait_for)
+        self.sink = Sink(self.peers, hold, on_begin)
+        if relays:
+            self.source.upstream, self.sink.feeds = self.sink.company, self.source
         self._poll = _POLL
-        self._say()
+        self.peers.say()
         steady_timer(node, _LOOK_EVERY, self._look)
 
     def output(self, msg_type: type, topic: str, qos: QoSProfile | None = None) -> Output:
@@ -84,8 +70,8 @@ class Flow:
             self.source.lost += turn.lost
             for session in turn.over:
                 if session.late:
-                    self._problem(f"joined {session.source} late: {session.late} of its messages "
-                                  "are not in what was made of them")
+                    self.peers.problem(f"joined {session.source} late: {session.late} of its "
+                                       "messages are not in what was made of them")
         return turn
 
     def finish(self, turn: Turn) -> None:
@@ -111,23 +97,14 @@ class Flow:
             self.source.lost += 1  # at least: its senders go on
         self.source.end(END)
         self.sink.leave()
-        deadline = time.monotonic() + _LAST_WORDS
-        while not self._publisher.wait_for_all_acked(AT_ONCE) and time.monotonic() < deadline:
-            time.sleep(_POLL)
-
-    def _join(self):
-        if self._relays:
-            if len(self.sink.feeding()) == 1:
-                self.source.begin()
-            else:
-                self.source.look()
+        self.peers.part()
 
     def _changed(self):
         self.sink.follow()
         if self._relays:
             self.source.look()  # those whom our senders know may be more
         self.source.advance()
-        self._say()
+        self.peers.say()
 
     def _look(self):
         self.peers.look()
@@ -135,12 +112,5 @@ class Flow:
         self.sink.report()
         self.source.look()
 
-    def _say(self):
-        state = State(self._listens, self.source.sending(), self.sink.joined())
-        if state != self._said:
-            self._said = state
-            self._publisher.publish(state.message())
-
-    def _problem(self, text):
-        self.problems.append(text)
-        self._node.get_logger().error(text)
+    def _state(self):
+        return State(self._listens, self.source.sending(), self.sink.joined())

@@ -1,6 +1,7 @@
 """The other instances of our nodes, as the graph shows them, and what they say."""
 
 import time
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -8,10 +9,11 @@ from dataclasses import replace
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from imu_fusion.nodes.flow.qos import PARTICIPANT, full_name, gid
+from imu_fusion.nodes.flow.qos import AT_ONCE, PARTICIPANT, SILENT, full_name, gid, made
 from imu_fusion.nodes.flow.state import MARK, STATE_QOS, State
 
 PATIENCE = 10.0  # s, for one that says nothing, or two that say it; longer than a lease
+_LAST_WORDS = 0.5  # s
 
 
 class Peer:
@@ -36,25 +38,50 @@ class Peer:
 
 
 class Peers(dict[str, Peer]):
-    """By instance. :meth:`look` compares them with the graph.
+    """By instance. :meth:`look` compares them with the graph, :meth:`say` tells them of us.
+
+    Attributes: ``own``, the topic of this node's state: its instance; ``participant``, how its
+    gids begin; ``problems``, texts: why the exit code is 1.
 
     Args:
-        own: topic of this node's own state.
+        state: returns what there is to say.
         changed: called when somebody has said something, has come or has gone.
-        problem: called with a text for the user.
     """
 
-    def __init__(self, node: Node, own: str, changed: Callable[[], None],
-                 problem: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, state: Callable[[], State],
+                 changed: Callable[[], None]) -> None:
         super().__init__()
-        self._node, self._own = node, own
-        self._changed, self._problem = changed, problem
+        self.node, self._state, self._changed = node, state, changed
+        self.own = f"{node.get_fully_qualified_name()}{MARK}i{uuid.uuid4().hex[:12]}"
+        self._publisher, own_gid = made(node.get_publishers_info_by_topic, self.own, lambda: (
+            node.create_publisher(DiagnosticArray, self.own, STATE_QOS, event_callbacks=SILENT)))
+        self.participant = own_gid[:PARTICIPANT]
+        self.problems: list[str] = []
+        self._said: State | None = None
         self._given_up: set[str] = set()
+
+    def say(self) -> None:
+        """Publish this node's state, if it is news."""
+        state = self._state()
+        if state != self._said:
+            self._said = state
+            self._publisher.publish(state.message())
+
+    def problem(self, text: str) -> None:
+        """Say what makes the exit code 1."""
+        self.problems.append(text)
+        self.node.get_logger().error(text)
+
+    def part(self) -> None:
+        """Give those who listen time to hear the last words."""
+        deadline = time.monotonic() + _LAST_WORDS
+        while not self._publisher.wait_for_all_acked(AT_ONCE) and time.monotonic() < deadline:
+            time.sleep(0.002)
 
     def look(self) -> None:
         """Find who has come and gone; believe what can be believed now."""
-        for topic, _ in self._node.get_topic_names_and_types():
-            if (MARK in topic and topic != self._own and topic not in self
+        for topic, _ in self.node.get_topic_names_and_types():
+            if (MARK in topic and topic != self.own and topic not in self
                     and topic not in self._given_up and self._writers(topic)):
                 peer = self[topic] = Peer(topic)
                 self._listen(peer)
@@ -63,12 +90,12 @@ class Peers(dict[str, Peer]):
                 self._examine(peer)
 
     def _writers(self, topic):
-        return {gid(info) for info in self._node.get_publishers_info_by_topic(topic)}
+        return {gid(info) for info in self.node.get_publishers_info_by_topic(topic)}
 
     def _listen(self, peer):
         if peer.subscription is not None:
-            self._node.destroy_subscription(peer.subscription)
-        peer.subscription = self._node.create_subscription(
+            self.node.destroy_subscription(peer.subscription)
+        peer.subscription = self.node.create_subscription(
             DiagnosticArray, peer.instance, lambda message: self._hear(peer, message), STATE_QOS)
 
     def _forget(self, peer):
@@ -83,7 +110,7 @@ class Peers(dict[str, Peer]):
             if last is not None:
                 peer.state = replace(peer.state, joined=last.joined)
             self._changed()
-        self._node.destroy_subscription(peer.subscription)
+        self.node.destroy_subscription(peer.subscription)
         del self[peer.instance]
         self._changed()
 
@@ -98,7 +125,7 @@ class Peers(dict[str, Peer]):
             peer.doubted = peer.doubted or time.monotonic()
             if time.monotonic() - peer.doubted > PATIENCE:
                 self._given_up.add(peer.instance)
-                self._problem(f"two publishers of {peer.instance}: neither is believed")
+                self.problem(f"two publishers of {peer.instance}: neither is believed")
                 self._forget(peer)
         elif peer.doubted is not None:
             peer.doubted = peer.heard = None
@@ -125,7 +152,7 @@ class Peers(dict[str, Peer]):
         for topic, sent in peer.heard.sending.topics.items():
             if not any(gid(info) == sent.writer and full_name(info) == peer.name
                        and sent.writer[:PARTICIPANT] == peer.writer[:PARTICIPANT]
-                       for info in self._node.get_publishers_info_by_topic(topic)):
+                       for info in self.node.get_publishers_info_by_topic(topic)):
                 if time.monotonic() - peer.heard_at > PATIENCE:
                     self._complain(peer, f"does not publish {topic}, as it says")
                 return
@@ -135,4 +162,4 @@ class Peers(dict[str, Peer]):
     def _complain(self, peer, what):
         if not peer.complained:
             peer.complained = True
-            self._node.get_logger().warning(f"{peer.instance} is ignored: {what}")
+            self.node.get_logger().warning(f"{peer.instance} is ignored: {what}")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -16,6 +17,7 @@ E = TypeVar("E")
 # goes there. What they tell of, QoS that do not match, a subscription tells as well.
 SILENT = PublisherEventCallbacks(use_default_callbacks=False)
 
+AT_ONCE = Duration(nanoseconds=0)
 DEPTH = 1000  # queue depth of writers, and of readers outside sessions
 
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from imu_fusion.nodes.flow.peers import Peer, Peers
 from imu_fusion.nodes.flow.qos import made, reliable_qos, session_qos
+from imu_fusion.nodes.flow.source import Source
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT, Joined, Sending, Taken
 
 AT_ONCE = 2000  # messages of one topic that are taken in one turn
@@ -106,7 +106,7 @@ class Input:
             node.get_subscriptions_info_by_topic, self.topic,
             lambda: node.create_subscription(self.msg_type, self.topic, callback, qos,
                                              raw=True, callback_group=self._sink.gate),
-            self._sink.participant)
+            self._sink.peers.participant)
 
     def _on_data(self, cdr, info):
         # What wakes the executor; the rest is taken with it in the next turn.
@@ -145,32 +145,25 @@ class Sink:
 
     Args:
         hold: while it returns true, no session is joined.
-        gate: while it returns false, nothing is taken.
-        may_answer: while it returns false, sessions that are joined are not answered.
         on_begin: called with the :class:`Session` that is about to be joined; may add inputs.
-        on_join: called when topics of a session are taken, before that is said.
-        say, problem: as of a source.
+
+    ``feeds``: the source, where there is one, that sends what is made of this; while it cannot,
+    nothing is taken.
     """
 
-    def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
-                 hold: Callable[[], bool], gate: Callable[[], bool],
-                 may_answer: Callable[[], bool], on_begin: Callable[[Session], None],
-                 on_join: Callable[[], None], say: Callable[[], None],
-                 problem: Callable[[str], None]) -> None:
-        self.node, self.participant = node, participant
+    def __init__(self, peers: Peers, hold: Callable[[], bool],
+                 on_begin: Callable[[Session], None]) -> None:
+        self.peers, self.node = peers, peers.node
+        self.feeds: Source | None = None
         self.inputs: dict[str, Input] = {}
         self.sessions: dict[str, Session] = {}  # by instance of the sender
-        self.gate = _Gate(gate)
+        self.gate = _Gate(lambda: self.feeds is None or self.feeds.ready())
         self.woken = False
-        self._may_answer = may_answer
-        self._peers, self._own = peers, own
-        self._hold, self._on_begin, self._on_join = hold, on_begin, on_join
-        self._say, self._problem = say, problem
+        self._hold, self._on_begin = hold, on_begin
         self._begun = False
         self._reported: dict[str, int] = {}  # topic -> count
         self._unreported = 0.0  # bytes
         self._report_at = 0.0
-        self._over: list[Session] = []
 
     def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None) -> Input:
         """A new :class:`Input`; ``qos`` is that outside sessions."""
@@ -184,7 +177,7 @@ class Sink:
 
     def company(self) -> set[str]:
         """The instances that the senders of these sessions know."""
-        return {i for s in self.feeding() for i in s.said.company} - {self._own}
+        return {i for s in self.feeding() for i in s.said.company} - {self.peers.own}
 
     def joined(self) -> Mapping[str, Joined]:
         """What is said of the sessions.
@@ -192,8 +185,10 @@ class Sink:
         One that feeds what this node sends is answered when that may be sent, and to all whom
         its sender knows: it begins when all behind this node are ready, too.
         """
+        ready = self.feeds is None or (
+            self.feeds.is_settled() and self.company() <= self.feeds.company)
         for session in self.sessions.values():
-            if not session.topics or self._may_answer():
+            if ready or not session.topics:
                 session.answered = session.said.version
         return {s.instance: Joined(s.id, s.answered, s.finished, {
             topic: Taken(self.inputs[topic].reader, base + self._reported.get(topic, 0),
@@ -203,11 +198,11 @@ class Sink:
 
     def follow(self) -> None:
         """Join, and hear how sessions end."""
-        for peer in list(self._peers.values()):
+        for peer in list(self.peers.values()):
             if peer.state is not None and peer.state.sending.session:
                 self._follow(peer)
         for session in list(self.sessions.values()):
-            if session.instance not in self._peers:
+            if session.instance not in self.peers:
                 if session.finished:
                     del self.sessions[session.instance]
                 elif not session.has_ended:
@@ -228,7 +223,7 @@ class Sink:
         if time.monotonic() - self._report_at > REPORT_EVERY or self._unreported > REPORT_BYTES:
             self._report_at, self._unreported = time.monotonic(), 0.0
             self._reported = {topic: i.count for topic, i in self.inputs.items() if i.sessions}
-            self._say()
+            self.peers.say()
 
     def take(self) -> Turn:
         """One turn: all that waits on all topics."""
@@ -250,19 +245,17 @@ class Sink:
                 turn.ended.append(topic)
                 turn.lost += self._compare(topic_input)
         if turn.ended:
-            self._over += [s for s in self.feeding() if s.has_ended and s not in self._over
-                           and not any(s in self.inputs[t].sessions for t in s.topics)]
-            turn.lost += sum(self._lacks(s) for s in self._over)
-        turn.over = list(self._over)
-        if turn.over and len(turn.over) == len(self.feeding()):
-            turn.event = turn.over[-1].event
+            turn.over = [s for s in self.feeding() if s.has_ended
+                         and not any(s in self.inputs[t].sessions for t in s.topics)]
+            turn.lost += sum(self._lacks(s) for s in turn.over)
+            if turn.over and len(turn.over) == len(self.feeding()):
+                turn.event = turn.over[-1].event
         return turn
 
     def done(self, sessions: list[Session]) -> None:
-        """Say that these sessions are finished."""
+        """Say that these sessions, of the last turn, are finished."""
         for session in sessions:
             session.finished = True
-        self._over = [s for s in self._over if not s.finished]
         if sessions:
             self._report_at = float("-inf")
             self.report()
@@ -271,7 +264,7 @@ class Sink:
         """The node stops, as it was asked to: nobody waits for it any more."""
         for session in self.sessions.values():
             session.finished = True
-        self._say()
+        self.peers.say()
 
     def _follow(self, peer):
         said = peer.state.sending
@@ -281,7 +274,7 @@ class Sink:
         elif session is not None and not session.finished:
             if not session.has_ended:
                 self._break(session, "was replaced by another")
-        elif said.event == BEGIN and self._own in said.company and not self._hold():
+        elif said.event == BEGIN and self.peers.own in said.company and not self._hold():
             self._join(peer, said)
 
     def _join(self, peer: Peer, said: Sending) -> None:
@@ -306,8 +299,12 @@ class Sink:
             self._name_others(topic, peer)
         if session.topics:
             self._begun = True
-            self._on_join()
-        self._say()
+            if self.feeds is not None:
+                if len(self.feeding()) == 1:
+                    self.feeds.begin()
+                else:
+                    self.feeds.look()
+        self.peers.say()
 
     def _name_others(self, topic, peer):
         names = sorted({i.node_name for i in self.node.get_publishers_info_by_topic(topic)
@@ -320,12 +317,12 @@ class Sink:
     def _break(self, session, why):
         session.broken = True
         if session.topics:
-            self._problem(f"the session of {session.source} broke off: it {why}")
+            self.peers.problem(f"the session of {session.source} broke off: it {why}")
 
     def _lacks(self, session):
         """What a session that is over lacks, beyond what was sent and not taken."""
         if session.said.lost:
-            self._problem(f"{session.source} made its messages of incomplete data: it lacks "
+            self.peers.problem(f"{session.source} made its messages of incomplete data: it lacks "
                           f"at least {session.said.lost} messages")
         return session.said.lost + session.late + session.broken
 
@@ -340,10 +337,10 @@ class Sink:
         surplus = topic_input.count - expected
         if surplus < 0:
             topic_input.lost -= surplus
-            self._problem(f"{topic_input.topic}: {-surplus} of {expected} messages LOST")
+            self.peers.problem(f"{topic_input.topic}: {-surplus} of {expected} messages LOST")
         elif surplus > 0 and not broken:
             topic_input.unexpected += surplus
-            self._problem(f"{topic_input.topic}: {surplus} messages more than the {expected} "
+            self.peers.problem(f"{topic_input.topic}: {surplus} messages more than the {expected} "
                           "of the session: somebody else publishes it, too")
         return max(0, -surplus)
 
@@ -354,4 +351,4 @@ class Sink:
         for session in idle:
             session.finished = True
         if idle:
-            self._say()
+            self.peers.say()

@@ -6,23 +6,28 @@ from collections import deque
 from collections.abc import Callable, Collection
 from typing import Any
 
-from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
 from imu_fusion.nodes.flow.peers import Peers
-from imu_fusion.nodes.flow.qos import SILENT, full_name, gid, made, reliable_qos, type_name
+from imu_fusion.nodes.flow.qos import (
+    AT_ONCE,
+    SILENT,
+    full_name,
+    gid,
+    made,
+    reliable_qos,
+    type_name,
+)
 from imu_fusion.nodes.flow.state import BEGIN, END, MARK, Joined, Sending, Sent
 
 WINDOW = 500  # messages sent before all must be acknowledged; half the depth of the queue
 WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
-GETTING_KNOWN = 1.0  # s, in which a new subscriber may turn out to be one of our nodes
+SETTLING = 1.0  # s without anybody new, after which all who are there are taken to be known
 
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # as rmw calls it
-AT_ONCE = Duration(nanoseconds=0)
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
 
@@ -46,7 +51,7 @@ class Output:
         self._publisher, self.writer = made(
             node.get_publishers_info_by_topic, self.topic,
             lambda: node.create_publisher(self.msg_type, self.name, qos, event_callbacks=SILENT),
-            self._source.participant)
+            self._source.peers.participant)
         self.qos = qos
         self.sent = self.start = self.bytes = 0
         self._flight = self._flight_bytes = 0
@@ -102,28 +107,26 @@ class Source:
 
     Args:
         peers: the other instances.
-        own: topic of this node's state, its instance; ``participant``: how its gids begin.
         wait_for: names of nodes that must have joined before the first message.
-        upstream: returns the instances that those know whose sessions this node processes.
-        say: called when :attr:`sending` has changed.
-        problem: called with a text for the user.
+
+    ``upstream``, where this node processes the sessions of others, returns the instances that
+    those know.
     """
 
-    def __init__(self, node: Node, peers: Peers, own: str, participant: str, *,
-                 wait_for: Collection[str], upstream: Callable[[], set[str]],
-                 say: Callable[[], None], problem: Callable[[str], None]) -> None:
-        self.node, self.participant = node, participant
+    def __init__(self, peers: Peers, wait_for: Collection[str]) -> None:
+        self.peers, self.node = peers, peers.node
+        self.upstream: Callable[[], set[str]] | None = None
         self.outputs: dict[str, Output] = {}
         self.phase = _LIVE
         self.lost = 0  # see Sending
         self.foreign: dict[str, list[str]] = {}
-        self._unknown_since: dict[str, float] = {}  # gid of a reader -> time
-        self._peers, self._own = peers, own
-        self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
-        self._upstream, self._say, self._problem = upstream, say, problem
-        self._session = ""
         self.company: set[str] = set()  # instances that must have joined
-        self._version = 0
+        self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
+        self._seen: set[str] = set()  # instances, and gids of readers that may be of others
+        # When anybody new was seen last.
+        self._news_at = float("-inf") if wait_for else time.monotonic()
+        self._session = ""
+        self._version = 0  # of the company
         self._takers: dict[str, tuple[str, Joined]] = {}  # instance -> name, what it said last
         self._event = ""  # with which the session is to end
         self._begin_after = False
@@ -154,7 +157,7 @@ class Source:
         for output in self.outputs.values():
             output.start = output.sent
         self.phase = _JOINING
-        self._peers.look()
+        self.peers.look()
         self.look(anew=True)
 
     def end(self, event: str = END) -> None:
@@ -195,14 +198,14 @@ class Source:
     def waiting_for(self) -> str:
         """Who keeps the source from sending or ending, in words; '' if nobody does."""
         if self.phase == _JOINING:
-            names = {peer.name for peer in self._peers.values() if peer.is_silent}
+            names = {peer.name for peer in self.peers.values() if peer.is_silent}
             names |= {instance.partition(MARK)[0] for instance in self._waiting()}
             names |= self._wait_for - self._names()
             return ("no answer yet from " + ", ".join(sorted(names)) if names
                     else "discovery is not complete")
         if self.phase == _LIVE:
             return ""
-        slow = sorted({self._peers[i].name for i, j in self._answers().items() if j is not None
+        slow = sorted({self.peers[i].name for i, j in self._answers().items() if j is not None
                        and not j.finished and (self.phase == _ENDED or any(
                            t in self.outputs and taken.taken < self.outputs[t].sent
                            for t, taken in j.topics.items()))})
@@ -212,25 +215,26 @@ class Source:
 
     def look(self, anew: bool = False) -> None:
         """Compare with the graph: who listens, who has come, who has gone."""
-        self._look_for_strangers()
+        self._look_around()
         if self.phase in (_JOINING, _OPEN):
-            known = self._upstream() | {
-                p.instance for p in self._peers.values() if p.state and p.state.listens}
+            known = {p.instance for p in self.peers.values() if p.state and p.state.listens}
+            if self.upstream is not None:
+                known |= self.upstream()
             if anew or known - self.company:
                 self.company |= known
                 self._version += 1
                 self.phase = _JOINING
-                self._say()
+                self.peers.say()
         else:
-            known = self.company & self._peers.keys()
+            known = self.company & self.peers.keys()
         for instance in self.company - known:
             self.company.discard(instance)
             name, joined = self._takers.get(instance, ("", None))
             if (joined is not None and joined.topics and not joined.finished
                     and any(output.sent > output.start for output in self.outputs.values())):
-                self._problem(f"{name} has vanished in mid-session")
+                self.peers.problem(f"{name} has vanished in mid-session")
             if self.phase != _ENDED:
-                self._say()
+                self.peers.say()
         self.advance()
 
     def advance(self) -> None:
@@ -239,17 +243,17 @@ class Source:
             return
         for instance, joined in self._answers().items():
             if joined is not None:
-                self._takers[instance] = self._peers[instance].name, joined
+                self._takers[instance] = self.peers[instance].name, joined
         if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
-            self._say()
+            self.peers.say()
         if self.phase == _OPEN:
             for output in self.outputs.values():
                 output.drain()
             if self._event and all(not output.waiting and output.acknowledged()
                                    for output in self.outputs.values()):
                 self.phase = _ENDED
-                self._say()
+                self.peers.say()
         if self.phase == _ENDED and all(j is not None and j.finished
                                         for j in self._answers().values()):
             self._close()
@@ -259,7 +263,8 @@ class Source:
         for name, joined in self._takers.values():
             lost = {topic: taken.lost for topic, taken in joined.topics.items() if taken.lost}
             if lost:
-                self._problem(f"{name} lost " + ", ".join(f"{n} of {t}" for t, n in lost.items()))
+                self.peers.problem(f"{name} lost "
+                                   + ", ".join(f"{n} of {t}" for t, n in lost.items()))
         for output in self.outputs.values():
             output.drain()
         if self._begin_after:
@@ -269,8 +274,8 @@ class Source:
         """What each of the company says of this session; None: nothing yet."""
         answers = {}
         for instance in self.company:
-            peer = self._peers.get(instance)
-            joined = peer.state.joined.get(self._own) if peer and peer.state else None
+            peer = self.peers.get(instance)
+            joined = peer.state.joined.get(self.peers.own) if peer and peer.state else None
             answers[instance] = joined if joined and joined.session == self._session else None
         return answers
 
@@ -280,14 +285,12 @@ class Source:
                 if joined is None or joined.version < self._version and not joined.finished}
 
     def _names(self):
-        return {self._peers[i].name for i, j in self._answers().items() if j is not None}
+        return {self.peers[i].name for i, j in self._answers().items() if j is not None}
 
     def _all_joined(self):
         """All have answered, and the readers that they speak of are matched."""
         if (self._waiting() or self._wait_for - self._names()
-                or any(peer.is_silent for peer in self._peers.values())
-                or any(time.monotonic() - since < GETTING_KNOWN
-                       for since in self._unknown_since.values())):
+                or any(peer.is_silent for peer in self.peers.values()) or self._is_settling()):
             return False
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
@@ -300,19 +303,25 @@ class Source:
                 return False
         return True
 
-    def _look_for_strangers(self):
+    def _is_settling(self):
+        """Whether somebody may be there who is not known yet."""
+        return time.monotonic() - self._news_at < SETTLING
+
+    def _look_around(self):
         """Find out who subscribes and is not, or not yet, known as one of ours."""
-        ours = {peer.name for peer in self._peers.values() if peer.state}
+        ours = {peer.name for peer in self.peers.values() if peer.state}
         ours.add(self.node.get_fully_qualified_name())
-        since: dict = {}
+        # With names to wait for, or known to those upstream, it is not time that tells who comes.
+        seen = set() if self._wait_for or self.upstream else set(self.peers)
         self.foreign = {}
         for topic in self.outputs:
             others = [info for info in self.node.get_subscriptions_info_by_topic(topic)
                       if full_name(info) not in ours]
-            since |= {gid(info): time.monotonic() for info in others}
+            seen |= set(map(gid, others))
             # A node's endpoints are discovered before its name.
             names = {full_name(info) for info in others if info.node_name != UNKNOWN_NODE}
             if names:
                 self.foreign[topic] = sorted(names)
-        self._unknown_since = since | {
-            g: t for g, t in self._unknown_since.items() if g in since}
+        if seen - self._seen:
+            self._news_at = time.monotonic()
+        self._seen = seen

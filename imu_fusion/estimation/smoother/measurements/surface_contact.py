@@ -7,7 +7,7 @@ linear solution: surfaces are Python (grids, splines). The kernel adds the heigh
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.params import SmootherParams
@@ -28,7 +28,8 @@ def surface_points(position_world: np.ndarray, quat_world_imu: np.ndarray,
     """
     if not np.any(lever_imu):
         return position_world
-    return position_world + Rotation.from_quat(quat_world_imu).apply(np.array(lever_imu))
+    attitude = scipy.spatial.transform.Rotation.from_quat(quat_world_imu)
+    return position_world + attitude.apply(np.array(lever_imu))
 
 
 def holds(constraint: Constraint, stamp: np.ndarray, events: JumpEvents | None,
@@ -108,7 +109,8 @@ def put_lever_derivatives(start: np.ndarray, contacts: np.ndarray, quat_world_im
         quat_world_imu: (N, 4). lever_imu: (3,) or (N, 3) m.
     """
     sample = np.repeat(np.arange(len(quat_world_imu)), np.diff(start))
-    along = Rotation.from_quat(quat_world_imu[sample]).inv().apply(contacts["position"])
+    attitude = scipy.spatial.transform.Rotation.from_quat(quat_world_imu[sample])
+    along = attitude.inv().apply(contacts["position"])
     lever = np.broadcast_to(lever_imu, quat_world_imu[:, :3].shape)[sample]
     contacts["attitude"], contacts["lever_arm"] = np.cross(lever, along), along
 
