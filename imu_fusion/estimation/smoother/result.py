@@ -64,8 +64,8 @@ class SmootherResult:
     ``converged``: None where the method passes once and so cannot tell.
     ``gnss_lag``: s, by which the receiver's stamps were found late and taken earlier.
     ``wander``: name -> how much larger than white noise leaves them its innovations are in the
-    mean over seconds (:func:`.whiteness.wandering`), 1 where they are white; the largest has
-    multiplied all standard deviations.
+    mean over seconds (:func:`.whiteness.wandering`), 1 where they are white; what is stated has
+    been widened by it (:func:`.whiteness.widen`).
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
@@ -144,7 +144,6 @@ class SmootherResult:
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
                              f"standard deviations: {_ADVICE[name]}")
-        widest = max(self.wander.values(), default=1.0)
         for name, excess in self.wander.items():
             if excess > 1.0:
                 texts.append(
@@ -152,8 +151,8 @@ class SmootherResult:
                     "times as large as white noise leaves them: a step or slow errors "
                     f"({_WANDERS.get(name, 'sensor noise')}), or noise and bias walks of the Imu "
                     "that are too small (sensor.gyro_noise_density, sensor.acc_noise_density, "
-                    "sensor.gyro_bias_walk, sensor.acc_bias_walk); all standard deviations are "
-                    f"{widest:.1f} times larger for it")
+                    "sensor.gyro_bias_walk, sensor.acc_bias_walk); the standard deviations of "
+                    f"{'attitudes' if name == 'mag' else 'all'} are as much larger")
         beside = self._beside()
         if beside is not None:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "

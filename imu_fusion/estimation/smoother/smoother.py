@@ -168,7 +168,7 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],
                                              problem.innovation[of_kind][:, :width])
     wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
-    widen(samples, max(1.0, *wander.values()))
+    widen(samples, wander)
     fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
     jump, failure = None, ""
     if hill is not None and solution.events is not None:

@@ -37,9 +37,18 @@ def wandering(stamp: np.ndarray, innovations: np.ndarray) -> float:
     return excess if excess > max(_EXCESS, by_chance) else 1.0
 
 
-def widen(samples: np.ndarray, factor: float) -> None:
-    """Make the standard deviations of smoothed samples larger by a factor, in place."""
-    for name in ("cov_position", "cov_velocity", "cov_attitude"):
+def widen(samples: np.ndarray, wander: dict[str, float]) -> None:
+    """Make the standard deviations of smoothed samples as much larger as innovations wander.
+
+    The field bears on attitudes, what a receiver says on all.
+
+    Args:
+        samples: of a SmootherResult, in place. wander: name -> factor.
+    """
+    receiver = max((f for name, f in wander.items() if name != "mag"), default=1.0)
+    widest = max(receiver, wander.get("mag", 1.0))
+    for name, factor in (("cov_position", receiver), ("cov_velocity", receiver),
+                         ("cov_attitude", widest)):
         samples[name] *= factor ** 2
-    for name in ("gyr_bias_sd", "acc_bias_sd"):
-        samples[name] *= factor
+    samples["acc_bias_sd"] *= receiver
+    samples["gyr_bias_sd"] *= widest
