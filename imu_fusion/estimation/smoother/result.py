@@ -152,7 +152,7 @@ class SmootherResult:
                     f"({_WANDERS.get(name, 'sensor noise')}), or noise and bias walks of the Imu "
                     "that are too small (sensor.gyro_noise_density, sensor.acc_noise_density, "
                     "sensor.gyro_bias_walk, sensor.acc_bias_walk); the standard deviations of "
-                    f"{'attitudes' if name == 'mag' else 'all'} are as much larger")
+                    f"{'headings' if name == 'mag' else 'all'} are as much larger")
         beside = self._beside()
         if beside is not None:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "

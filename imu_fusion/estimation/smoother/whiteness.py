@@ -6,6 +6,7 @@ that rests on averaging is less certain by as much.
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 _BLOCK = 5_000_000_000   # ns, over which innovations are averaged
@@ -40,15 +41,19 @@ def wandering(stamp: np.ndarray, innovations: np.ndarray) -> float:
 def widen(samples: np.ndarray, wander: dict[str, float]) -> None:
     """Make the standard deviations of smoothed samples as much larger as innovations wander.
 
-    The field bears on attitudes, what a receiver says on all.
+    What a receiver says bears on all. The field bears on headings: gravity tells the tilt.
 
     Args:
         samples: of a SmootherResult, in place. wander: name -> factor.
     """
     receiver = max((f for name, f in wander.items() if name != "mag"), default=1.0)
-    widest = max(receiver, wander.get("mag", 1.0))
-    for name, factor in (("cov_position", receiver), ("cov_velocity", receiver),
-                         ("cov_attitude", widest)):
-        samples[name] *= factor ** 2
-    samples["acc_bias_sd"] *= receiver
-    samples["gyr_bias_sd"] *= widest
+    for name in ("cov_position", "cov_velocity", "cov_attitude"):
+        samples[name] *= receiver ** 2
+    for name in ("acc_bias_sd", "gyr_bias_sd"):
+        samples[name] *= receiver
+    field = wander.get("mag", 1.0)
+    if field > receiver:
+        up = Rotation.from_quat(samples["quat_world_imu"]).as_matrix()[:, 2]
+        heading = np.einsum("ni,nij,nj->n", up, samples["cov_attitude"], up)
+        more = ((field / receiver) ** 2 - 1.0) * heading
+        samples["cov_attitude"] += more[:, None, None] * up[:, :, None] * up[:, None]
