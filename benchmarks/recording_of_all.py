@@ -11,15 +11,15 @@ from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 
-PRESET = Path(__file__).parents[1] / "config" / "head_four_accelerometers.yaml"
+CONFIG = Path(__file__).parents[1] / "config"
 NODE = "acceleration_field_estimator"
 MOVEMENT = Path(__file__).parents[1] / "bags" / "broad_06_fast_rotation"
 IMU_RATE, FIX_RATE = 200, 10  # Hz; the accelerometers have 1 kHz
 
 
-def write_parameters(path):
-    """Those of the head with four accelerometers, which is never still here."""
-    values = yaml.safe_load(PRESET.read_text())
+def write_parameters(path, config=CONFIG):
+    """Those of the head with four accelerometers, which is never still here: their names."""
+    values = yaml.safe_load((config / "head_four_accelerometers.yaml").read_text())
     values[NODE]["ros__parameters"]["initial"] = {"mode": "given",
                                                   "angular_velocity": [5.0, 5.0, 5.0]}
     path.write_text(yaml.safe_dump(values))

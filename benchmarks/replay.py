@@ -1,36 +1,88 @@
-"""A 10-minute recording through the nodes at rate 0, in processes: what is lost, how fast.
+"""The nodes as processes: how fast a recording passes through them, and what they cost live.
 
-    python -m benchmarks.replay [runs]
+    python -m benchmarks.replay [RUNS [ANOTHER CHECKOUT]]
+
+With another checkout, its nodes take turns with ours. CPU is that of the processes (user and
+system), as the difference of two durations: neither their start nor other work on the machine
+counts.
 """
 
 import os
-import resource
-import shutil
+import statistics
+import subprocess
 import sys
 import tempfile
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
 
+from benchmarks.acceleration_field_live import cpu_seconds
+from benchmarks.recording_of_all import write_parameters, write_recording
+from benchmarks.table import RESULTS
 from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.messages.layouts import IMU
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
 
-DURATION = 600  # s
+HERE = Path(__file__).resolve().parents[1]
+BAG = HERE / "bags" / "broad_06_fast_rotation"
 RATE = 286  # Hz, of each topic
-BAG = Path(__file__).resolve().parents[1] / "bags" / "broad_06_fast_rotation"
-RESULT = Path(__file__).parent / "results" / "replay.md"
+LONG, SHORT, LIVE = 240, 40, 30  # s of recorded time
 TOPICS = ("imu/data_raw", "imu/mag", "imu/data")
+AT_RATE_ZERO = ("replayer", "orientation_estimator", "recorder")
+BOUND = ("first", "middle", "last")
+ALL = ("orientation_estimator", "acceleration_field_estimator", "smoother")
+DRIVER = """
+import sys, time
+import rclpy
+from imu_fusion.nodes.base import message_class
+from imu_fusion.nodes.flow import reliable_qos
+from imu_fusion.recordings.bag_reader import open_bag
+rclpy.init()
+node = rclpy.create_node("driver")
+with open_bag(sys.argv[1]) as reader:
+    outs = {t: node.create_publisher(message_class(i.msgtype), t, reliable_qos())
+            for t, i in reader.topics.items()}
+    while not all(out.get_subscription_count() >= 2 for out in outs.values()):
+        time.sleep(0.1)
+    time.sleep(1.0)
+    messages = list(reader.messages())
+start, first = time.monotonic(), messages[0][2]
+for topic, _, stamp, cdr in messages:
+    wait = start + (stamp - first) * 1e-9 - time.monotonic()
+    if wait > 0:
+        time.sleep(wait)
+    outs[topic].publish(bytes(cdr))
+time.sleep(1.0)
+"""
 
 
-def long_recording(path):
-    """The movement of ``BAG``, repeated and resampled in time, as 10 minutes at 286 Hz."""
+@contextmanager
+def nodes_of(checkout, logs):
+    """NodeProcesses that run the code of a checkout."""
+    before, path = Path.cwd(), os.environ.get("PYTHONPATH")
+    os.chdir(checkout)  # Python looks there first
+    os.environ["PYTHONPATH"] = str(checkout)
+    try:
+        with NodeProcesses(logs) as nodes:
+            yield nodes
+    finally:
+        os.chdir(before)
+        os.environ.pop("PYTHONPATH")
+        if path is not None:
+            os.environ["PYTHONPATH"] = path
+
+
+def write_orientation(path, seconds):
+    """The movement of ``BAG``, repeated and resampled in time: stamps."""
     with open_bag(BAG) as reader:
         imu, mag = read_log(reader, "imu/data_raw"), read_log(reader, "imu/mag")
-    stamps = imu.stamp[0] + np.round(np.arange(DURATION * RATE) * 1e9 / RATE).astype(np.int64)
+    stamps = imu.stamp[0] + np.round(np.arange(seconds * RATE) * 1e9 / RATE).astype(np.int64)
     with BagWriter(path) as writer:
         for i, stamp in enumerate(stamps.tolist()):
             k = i % min(len(imu), len(mag))
@@ -41,64 +93,183 @@ def long_recording(path):
     return stamps
 
 
-def replay_once(bag, stamps, out):
-    """One replay: (messages lost per topic, seconds first to last message, CPU seconds)."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with NodeProcesses(logs=out.parent / f"{out.name}_logs") as nodes:
-        nodes.start("recorder", out=str(out), topics=TOPICS)
-        nodes.start("orientation_estimator", qos="reliable")
-        nodes.start("replayer", bag=str(bag), rate=0.0, wait_for_subscribers=0,
-                    wait_for_nodes=("recorder", "orientation_estimator"), wait_timeout=60.0)
-        nodes.wait("replayer", 900)
-        nodes.wait("recorder", 60)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    lost = {}
-    with open_bag(out) as reader:
-        for topic in TOPICS:
-            found = read_log(reader, topic).stamp
-            if not np.array_equal(found, np.intersect1d(found, stamps)):
-                raise SystemExit(f"{topic}: stamps out of order, repeated or invented")
-            lost[topic] = len(stamps) - len(found)
-        return lost, (reader.end_time - reader.start_time) * 1e-9, cpu
+def watch(processes):
+    """CPU seconds of each, when all have ended."""
+    used = dict.fromkeys(processes, 0.0)
+    while any(p.poll() is None for p in processes.values()):
+        for name, process in processes.items():
+            if process.poll() is None:
+                used[name] = cpu_seconds(process)
+        time.sleep(0.05)
+    return used
 
 
-def main(runs=10):
-    """Run and write the table."""
-    rows = []
+def replay_once(checkout, bag, stamps, seconds, folder):
+    """One replay: (messages lost, messages recorded per second, {node: CPU seconds})."""
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        out = Path(own) / "out"
+        with nodes_of(checkout, Path(own) / "logs") as nodes:
+            nodes.start("recorder", out=str(out), topics=TOPICS)
+            nodes.start("orientation_estimator", qos="reliable")
+            nodes.start("replayer", bag=str(bag), rate=0.0, wait_for_subscribers=0,
+                        duration=float(seconds), wait_timeout=60.0,
+                        wait_for_nodes=("recorder", "orientation_estimator"))
+            estimator = nodes.process("orientation_estimator")
+            ending = {n: nodes.process(n) for n in ("replayer", "recorder")}
+            used = watch(ending)
+            used["orientation_estimator"] = cpu_seconds(estimator)
+        sent = stamps[stamps < stamps[0] + seconds * 10**9]
+        lost = 0
+        with open_bag(out) as reader:
+            for topic in TOPICS:
+                found = read_log(reader, topic).stamp
+                if not np.array_equal(found, np.intersect1d(found, sent)):
+                    raise SystemExit(f"{topic}: stamps out of order, repeated or invented")
+                lost += len(sent) - len(found)
+            took = (reader.end_time - reader.start_time) * 1e-9
+        return lost, (3 * len(sent) - lost) / took, used
+
+
+def bound_once(count):
+    """CPU seconds of the three processes of publish_and_take."""
+    domain = {"ROS_DOMAIN_ID": "99", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return watch({role: subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.publish_and_take", role, str(count)], cwd=HERE,
+        env=os.environ | domain | {"PYTHONPATH": str(HERE)}) for role in reversed(BOUND)})
+
+
+def per_100_000(long, short, names):
+    """CPU seconds per 100,000 recorded messages, of each process."""
+    messages = 3 * RATE * (LONG - SHORT)
+    return [(long[name] - short[name]) * 1e5 / messages for name in names]
+
+
+def published(path):
+    """{topic: {header stamp: time of publication, ns}} of the topics of Imu messages."""
+    found = {}
+    for file in path.glob("*.mcap"):
+        with open(file, "rb") as stream:
+            for schema, channel, message in make_reader(stream).iter_messages():
+                if schema.name == IMU.msgtype:
+                    stamp = IMU.decode(message.data)[0]
+                    found.setdefault(channel.topic, {})[stamp] = message.publish_time
+    return found
+
+
+def live_once(checkout, bag, nodes_there, folder):
+    """A driver in real time: ({node: share of a core}, {output: its delays, ms})."""
+    with tempfile.TemporaryDirectory(dir=folder) as own, nodes_of(
+            checkout, Path(own) / "logs") as nodes:
+        preset = Path(own) / "parameters.yaml"
+        write_parameters(preset, checkout / "config")
+        nodes.start("recorder", out=f"{own}/out")
+        for node in nodes_there:
+            nodes.start(node, params_file=preset, qos="reliable")
+        driver = subprocess.Popen(
+            [sys.executable, "-c", DRIVER, str(bag)], cwd=HERE, env=os.environ | {
+                "PYTHONPATH": str(HERE), "ROS_DOMAIN_ID": str(nodes.domain),
+                "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+        recorded = Path(own) / "out" / "out_0.mcap"
+        while not recorded.exists() or recorded.stat().st_size < 500_000:
+            time.sleep(0.1)
+            if driver.poll() is not None:
+                raise SystemExit("nothing was recorded")
+        time.sleep(3.0)
+        began = time.monotonic()
+        before = {n: cpu_seconds(nodes.process(n)) for n in nodes_there}
+        time.sleep(15.0)
+        took = time.monotonic() - began
+        share = {n: (cpu_seconds(nodes.process(n)) - before[n]) / took for n in nodes_there}
+        driver.wait(120)
+        nodes.process("recorder").send_signal(2)
+        nodes.process("recorder").wait(60)
+        times = published(Path(own) / "out")
+    delays = {}
+    for output, source in (("/imu/data", "/imu/data_raw"),
+                           ("/acceleration_field/imu", "/accelerometers/back")):
+        made, came = times.get(output, {}), times.get(source, {})
+        if made:
+            delays[output] = [(made[s] - came[s]) * 1e-6 for s in made if s in came]
+    return share, delays
+
+
+def at_rate_zero(checkouts, runs, folder):
+    """Lines of the table."""
+    stamps = write_orientation(folder / "bag", LONG)
+    lines = ["| | lost | recorded messages/s: median, each | CPU s per 100,000 recorded: "
+             "replayer, estimator, recorder | sum | load |", "|---|---|---|---|---|---|"]
+    found = {name: [] for name in checkouts}
+    bounds = []
+    for _ in range(runs):
+        bounds.append(per_100_000(bound_once(RATE * LONG), bound_once(RATE * SHORT), BOUND))
+        print("bound", bounds[-1], flush=True)
+        for name, checkout in checkouts.items():
+            long, short = (replay_once(checkout, folder / "bag", stamps, s, folder)
+                           for s in (LONG, SHORT))
+            found[name].append((long[0] + short[0], long[1],
+                                per_100_000(long[2], short[2], AT_RATE_ZERO), os.getloadavg()[0]))
+            print(name, *found[name][-1], flush=True)
+    for name, rows in found.items():
+        speeds = [row[1] for row in rows]
+        cpu = np.median([row[2] for row in rows], axis=0)
+        lines.append(
+            f"| {name} | {sum(row[0] for row in rows)} | {statistics.median(speeds):.0f}: "
+            + ", ".join(f"{s:.0f}" for s in speeds) + " | "
+            + ", ".join(f"{c:.1f}" for c in cpu) + f" | {cpu.sum():.1f} | "
+            + ", ".join(f"{row[3]:.1f}" for row in rows) + " |")
+    cpu = np.median(bounds, axis=0)
+    lines.append("| bytes published and taken, no work | | | "
+                 + ", ".join(f"{c:.1f}" for c in cpu) + f" | {cpu.sum():.1f} | |")
+    return lines
+
+
+def live(checkouts, runs, folder):
+    """Lines of the table."""
+    write_orientation(folder / "orientation", LIVE)
+    write_recording(folder / "all", write_parameters(folder / "p.yaml"), LIVE)
+    lines = ["| live | | CPU, % of a core: median | together | delay of imu/data ms: p50, p99 | of "
+             "acceleration_field/imu | load |", "|---|---|---|---|---|---|---|"]
+    for bag, nodes in (("orientation", ALL[:1]), ("all", ALL)):
+        found = {name: [] for name in checkouts}
+        for _ in range(runs):
+            for name, checkout in checkouts.items():
+                found[name].append((*live_once(checkout, folder / bag, nodes, folder),
+                                    os.getloadavg()[0]))
+                print(bag, name, found[name][-1][0], flush=True)
+        for name, rows in found.items():
+            shares = [100 * statistics.median(row[0][n] for row in rows) for n in nodes]
+            delays = []
+            for output in ("/imu/data", "/acceleration_field/imu"):
+                both = [np.percentile(row[1][output], [50, 99]) for row in rows if output in row[1]]
+                delays.append("{:.2f}, {:.2f}".format(*np.median(both, axis=0)) if both else "")
+            lines.append(f"| {', '.join(nodes)} | {name} | "
+                         + ", ".join(f"{s:.0f}" for s in shares) + f" | {sum(shares):.0f} | "
+                         + " | ".join(delays) + " | "
+                         + ", ".join(f"{row[2]:.1f}" for row in rows) + " |")
+    return lines
+
+
+def main(runs=3, other=None):
+    """Run and write the tables."""
+    checkouts = {"this one": HERE} | ({"before": Path(other).resolve()} if other else {})
     with tempfile.TemporaryDirectory(prefix="replay_") as folder:
         folder = Path(folder)
-        stamps = long_recording(folder / "bag")
-        for i in range(runs):
-            started = time.monotonic()
-            lost, seconds, cpu = replay_once(folder / "bag", stamps, folder / f"out{i}")
-            rows.append((lost, seconds, time.monotonic() - started, cpu, os.getloadavg()[0]))
-            print(i + 1, *rows[-1], flush=True)
-            shutil.rmtree(folder / f"out{i}")
-    seconds = np.array([row[1] for row in rows])
-    messages = len(TOPICS) * len(stamps)
-    lines = [
-        f"{DURATION} s at {RATE} Hz Imu and MagneticField (the samples of bags/{BAG.name}, "
-        "repeated) at rate 0 through replayer, orientation_estimator and recorder: three "
-        f"processes over Fast DDS on {os.cpu_count()} cores that others used too (load: mean "
-        f"number of processes that want a core, ours included). {messages} messages recorded per run, "
-        "compared by their stamps. The first run may compile kernels.",
-        "",
-        "| run | lost imu/data_raw | lost imu/mag | lost imu/data | first to last message s | "
-        "with start and end s | CPU s of the three | load | real-time factor | "
-        "recorded messages/s |",
-        "|---|---|---|---|---|---|---|---|---|---|"]
-    for i, (lost, took, total, cpu, load) in enumerate(rows):
-        cells = [str(i + 1), *(str(lost[t]) for t in TOPICS), f"{took:.1f}", f"{total:.1f}",
-                 f"{cpu:.0f}", f"{load:.1f}", f"{DURATION / took:.1f}", f"{messages / took:.0f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", f"Lost in {runs} runs: {sum(sum(row[0].values()) for row in rows)}. "
-              f"Real-time factor: median {DURATION / np.median(seconds):.1f}, "
-              f"worst {DURATION / seconds.max():.1f}, best {DURATION / seconds.min():.1f}."]
-    RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text("\n".join(lines) + "\n")
-    print(RESULT.read_text())
+        tables = [at_rate_zero(checkouts, int(runs), folder), live(checkouts, int(runs), folder)]
+    text = "\n".join([
+        f"`python -m benchmarks.replay {runs} OTHER`; \"before\" is another checkout, whose nodes "
+        "took turns with these. "
+        f"{os.cpu_count()} cores, which others used, too (load: mean number of processes that "
+        "want a core, ours included).", "",
+        f"{LONG} s at {RATE} Hz Imu and MagneticField (bags/{BAG.name}, repeated) at rate 0 through "
+        "replayer, orientation_estimator and recorder, three processes over Fast DDS; recorded "
+        "messages are compared by their stamps.", "", *tables[0], "",
+        f"A driver in real time, a recorder beside: Imu and MagneticField at {RATE} Hz through the "
+        "orientation estimator; and four accelerometers at 1 kHz, Imu and MagneticField at 200 Hz "
+        "and fixes at 10 Hz through all three. Delays are between the publication of a "
+        "sample and that of its estimate.", "", *tables[1], ""])
+    (RESULTS / "replay.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(*sys.argv[1:])

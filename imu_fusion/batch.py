@@ -7,16 +7,17 @@ recording and parameters the estimates are those of the nodes, bit for bit.
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import ImuFusionError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
-from imu_fusion.recordings.results import write_results
+from imu_fusion.recordings.results import LEFT_OUT, RECORDING, write_results
 from imu_fusion.recordings.targets import refuse_source
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.registry import STAGES
@@ -46,13 +47,18 @@ class _Feed:
     def __init__(self, stage: Stage, report: StageReport, names: Mapping[str, str],
                  write: Write | None) -> None:
         self._stage, self._report, self._names, self._write = stage, report, names, write
-        self._recorded: dict[str, list] = {topic: [] for topic in names}
+        # An index may promise messages that are lost.
+        self._recorded: dict[str, list] = {topic: [(
+            np.empty(0, np.int64), np.empty((0, stage.inputs[topic].width)), [])]
+            for topic in names}
         self._stream = stage.stream(*report.params, warn=report.warnings.append)
         self._stream.concludes = True
         self._stream.reset(list(names))
 
     def take(self, block: Block) -> None:
         """Messages of the recording."""
+        if self._report.skipped:
+            return
         found = {}
         for topic, name in self._names.items():
             kind = self._stage.inputs[topic]
@@ -61,7 +67,12 @@ class _Feed:
                 found[topic] = decoded
                 self._recorded[topic].append((decoded.stamp, kind.values(decoded.values),
                                               decoded.frame_ids[:1]))
-        self._hand_on(self._stream.take_decoded(found))
+        try:
+            self._hand_on(self._stream.take_decoded(found))
+        except BagError:    # of the writer
+            raise
+        except ImuFusionError as error:    # the other stages go on
+            self._report.skipped = str(error)
 
     def finish(self) -> None:
         """The end of the recording: what is held back, and the report."""
@@ -71,17 +82,26 @@ class _Feed:
                     np.concatenate([v for _, v, _ in parts]),
                     next((f[0] for _, _, f in parts if f), ""))
                 for topic, parts in self._recorded.items()}
-        report.findings = list(self._stage.findings(logs))
         del self._recorded
         try:
+            report.findings = list(self._stage.findings(logs))
+            if report.skipped:
+                return
             self._hand_on(stream.finish())
             conclusion = stream.conclude()
             for made in conclusion.made if self._write else ():
                 self._hand_on(made)
             report.results, report.summary = dict(conclusion.results), conclusion.summary
             report.remarks, report.detail = list(conclusion.remarks), conclusion.detail
-        except ImuFusionError as error:    # the others go on
+        except BagError:    # of the writer
+            raise
+        except ImuFusionError as error:    # the other stages go on
             report.skipped = str(error)
+        finally:
+            self._count()
+
+    def _count(self) -> None:
+        report, stream = self._report, self._stream
         for topic in self._names:
             report.used[topic] = stream.guards[topic].counts[Verdict.OK]
             refused = stream.refused(topic)
@@ -139,12 +159,20 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
                 if report.summary:
                     progress(f"{stage.node}: {report.summary}")
             warnings = list(reader.warnings)
-            write_results(writer.directory, {report.node: report.results for report in reports
-                                             if report.results})
+            results = {report.node: report.results for report in reports if report.results}
+            write_results(writer.directory, results | _left_out(reader, reports))
     warnings += [text for report in reports for text in report.findings]
     warnings += [f"{report.node}: {text}" for report in reports
                  for text in (*report.warnings, *report.remarks)]
     return reports, list(dict.fromkeys(warnings))
+
+
+def _left_out(reader: Reader, reports: Sequence[StageReport]) -> dict[str, dict]:
+    """What was lost or refused, as results.json holds it; empty where nothing was."""
+    found: dict[str, Any] = {report.node: report.refused for report in reports if report.refused}
+    if reader.damaged:
+        found[RECORDING] = list(reader.warnings)
+    return {LEFT_OUT: found} if found else {}
 
 
 def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | None = None,

@@ -1,7 +1,8 @@
 """The command line: ``imu_fusion --help``.
 
 Every command prints errors of the user in one line and ends with exit code 1;
-wrong usage ends with 2, an interrupted command with 130.
+wrong usage ends with 2, an interrupted command with 130. Where a recording was damaged and all
+that could be read of it was used, the code is 3.
 """
 
 import importlib
@@ -19,6 +20,7 @@ from imu_fusion.nodes import NODES
 
 PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True}
 console = Console(highlight=False)
+INCOMPLETE = 3
 
 
 class _Group(click.Group):
@@ -121,6 +123,7 @@ def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...
     that the nodes publish, bit for bit.
     """
     from imu_fusion import batch
+    from imu_fusion.recordings.results import is_incomplete
     reports, warnings = batch.process(bag, out, params_file, without, _remaps(remap), overwrite,
                                       progress=lambda text: click.echo(text, err=True))
     for warning in warnings:
@@ -137,6 +140,8 @@ def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...
             table.add_row(report.node, topic, "", "", str(count))
     console.print(table)
     click.echo(f"written: {out}")
+    if is_incomplete(out):
+        sys.exit(INCOMPLETE)
 
 
 @cli.command()
@@ -178,9 +183,10 @@ def info(bag: str, target: str | None) -> None:
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
-        for warning in [*reader.warnings, *read_losses(reader)]:
-            click.echo(f"warning: {warning}")
+        losses = read_losses(reader)
         rows = inspect_topics(reader)
+        for warning in [*reader.warnings, *losses]:    # reading finds what is damaged inside
+            click.echo(f"warning: {warning}")
         click.echo(f"{'topic':<32} {'type':<44} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")
         for row in rows:
             click.echo(f"{row.topic:<32} {row.msgtype.replace('/msg/', '/'):<44} {row.count:>9} "
@@ -191,6 +197,20 @@ def info(bag: str, target: str | None) -> None:
     if target:
         counts = repair(bag, target)
         click.echo(f"written: {target} with {sum(counts.values())} messages")
+    elif reader.damaged:
+        click.echo("imu_fusion info --repair OUT writes a clean copy of what can be read",
+                   err=True)
+    if reader.damaged:
+        sys.exit(INCOMPLETE)
+
+
+def _tell(reader):
+    """Say what is wrong with a recording that has been read; end with INCOMPLETE if it was not
+    all of it."""
+    for warning in reader.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    if reader.damaged:
+        sys.exit(INCOMPLETE)
 
 
 def _number(value, form):
@@ -233,21 +253,20 @@ def convert(source: str, out: str, topics: tuple[str, ...], description: str | N
         return
     from imu_fusion.recordings.bag_reader import open_bag
     from imu_fusion.recordings.bag_writer import BagWriter
+    from imu_fusion.recordings.repair import copy
     from imu_fusion.recordings.targets import refuse_source
     refuse_source(source, out)
     names = {other: name for name, other in _remaps(remap).items()}
     with open_bag(source) as reader:
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
         renamed = {reader.require(other).name: name for other, name in names.items()}
-        with (BagWriter(out, overwrite=overwrite, typestore=reader.typestore,
-                        whole=True) as writer,
+        with (BagWriter(out, overwrite=overwrite, whole=True) as writer,
               click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
                                 length=sum(reader.topics[t].count or 0 for t in kept),
                                 file=sys.stderr) as messages):
-            for topic, msgtype, log_time, cdr in messages:
-                writer.write(renamed.get(topic, topic), msgtype, cdr, log_time,
-                             qos=reader.topics[topic].qos_profiles or None)
+            copy(reader, writer, kept, renamed, messages)
     click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
+    _tell(reader)
 
 
 @cli.command(context_settings=PASS_ON)

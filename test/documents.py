@@ -223,7 +223,9 @@ class Checker:
         verb = " ".join(words[:2])
         rest = words[2:]
         if words[:2] == ["run", "imu_fusion"]:
-            if rest[0] not in NODES:
+            if rest[0] == "imu_fusion":
+                self.cli(rest[1:] or ["--help"])
+            elif rest[0] not in NODES:
                 self.complain(f"no node '{rest[0]}'")
             else:
                 self.ros_arguments(rest[0], rest[1:])

@@ -60,7 +60,8 @@ def test_process_writes_a_recording_that_others_can_read(tmp_path):
     (["process", "{other}", "{out}"], r"--remap imu/data_raw:=/robot/imu"),
     (["process", "{bag}", "{out}", "--without", "orientation"], "no estimator 'orientation'"),
     (["process", "{bag}", "{out}", "--without", "orientation_estimator"], "switched off"),
-    (["process", "{bag}", "{bag}"], "not empty"),
+    (["process", "{bag}", "{bag}"], "would be destroyed"),
+    (["process", "{bag}", "{other}"], "not empty"),
     (["process", "{bag}", "{out}", "--params-file", "{missing}"], "cannot be read"),
     (["process", "{bag}", "{out}", "--remap", "imu/data_raw:=/imu/mag"],
      "is sensor_msgs/msg/MagneticField, expected sensor_msgs/msg/Imu"),
@@ -139,11 +140,14 @@ def test_topics_of_unknown_types_are_left_alone_and_kept_by_convert(tmp_path):
     types = get_typestore(Stores.ROS2_JAZZY)
     types.register(get_types_from_msg("float64 torque\nstring joint", "robot_msgs/msg/Joint"))
     joint = types.types["robot_msgs/msg/Joint"](torque=1.5, joint="knee")
-    with BagWriter(tmp_path / "bag", typestore=types) as writer:
+    definition = (types.generate_msgdef("robot_msgs/msg/Joint", ros_version=2)[0],
+                  types.hash_rihs01("robot_msgs/msg/Joint"))
+    with BagWriter(tmp_path / "bag") as writer:
         for i in range(300):
             stamp = START + i * STEP
             writer.write("/joint", "robot_msgs/msg/Joint",
-                         bytes(types.serialize_cdr(joint, "robot_msgs/msg/Joint")), stamp)
+                         bytes(types.serialize_cdr(joint, "robot_msgs/msg/Joint")), stamp,
+                         definition=definition)
             writer.write("/imu/data_raw", IMU.msgtype,
                          imu_message(stamp, "imu_link", [0, 0, 0], [0, 0, 9.81]), stamp)
     bag = str(tmp_path / "bag")
@@ -153,4 +157,5 @@ def test_topics_of_unknown_types_are_left_alone_and_kept_by_convert(tmp_path):
     with open_bag(tmp_path / "copy") as reader:
         assert reader.topics["/joint"].count == 300
         *_, cdr = next(reader.messages(["/joint"]))
-        assert reader.typestore.deserialize_cdr(cdr, "robot_msgs/msg/Joint").joint == "knee"
+        assert types.deserialize_cdr(cdr, "robot_msgs/msg/Joint").joint == "knee"
+        assert reader.definition("/joint") == definition

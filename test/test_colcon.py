@@ -17,8 +17,8 @@ from test.test_registry import node_class
 REPOSITORY = Path(__file__).resolve().parents[1]
 COLCON = Path(sys.executable).parent / "colcon"
 # Keys of rosdep/python.yaml that hold on Ubuntu 24.04; ROS packages are keys by themselves.
-PYTHON_KEYS = {"python3-click", "python3-numpy", "python3-scipy", "python3-yaml",
-               "python3-pytest"}
+PYTHON_KEYS = {"python3-click", "python3-numpy", "python3-pymap3d", "python3-rich",
+               "python3-scipy", "python3-yaml", "python3-pytest"}
 ROS_KEYS = {"rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "nav_msgs",
             "rosgraph_msgs", "sensor_msgs", "std_msgs", "std_srvs", "launch", "launch_ros",
             "rcl_interfaces", "tf2_msgs", "tf2_ros", "tf2_ros_py"}

@@ -6,7 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import rclpy
 import rclpy.node
@@ -17,7 +17,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
@@ -84,6 +84,7 @@ class Node(rclpy.node.Node):
     NAME: str = ""
     PARAMETERS: tuple[type[Parameters], ...] = ()
     OPEN_PREFIXES: tuple[str, ...] = ()
+    _flow: Any = None  # a Flow, if the node takes part in sessions
 
     def __init__(self, params_files: Sequence[str] = (), **kwargs):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
@@ -100,6 +101,13 @@ class Node(rclpy.node.Node):
     def work(self) -> float:
         """Called between callbacks; returns the seconds that the executor may wait."""
         return IDLE
+
+    def wait(self, executor: Executor, seconds: float) -> None:
+        """Let callbacks run, or wait for one, at most so long."""
+        if self._flow is None:
+            executor.spin_once(timeout_sec=seconds)
+        else:
+            self._flow.wait(executor, seconds)
 
     def stop(self) -> None:
         """Asked to end (signal): do what is needed until ``finished`` is true."""
@@ -249,7 +257,7 @@ def _run(node_class, signals, params_files):
                 stopping = True
                 node.stop()
             else:
-                executor.spin_once(timeout_sec=node.work())
+                node.wait(executor, node.work())
     except ExternalShutdownException:
         pass
     finally:

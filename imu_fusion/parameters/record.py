@@ -18,14 +18,17 @@ def record_dtype(cls: type[Parameters]) -> np.dtype:
 
     float: f8, nan where unset; int: i8; bool: bool; a tuple of numbers: an array of its (largest)
     length, nan where unset, one value standing for all; a group: a nested record. Strings,
-    tuples without a length and unset integers are for the estimator, not for its kernel: left out.
+    tuples without a length, unset integers and groups of nothing else are for the estimator, not
+    for its kernel: left out.
     """
     if cls in _DTYPES:
         return _DTYPES[cls]
     fields: list[tuple[Any, ...]] = []
     for field, kind in fields_of(cls):
         if is_group(kind):
-            fields.append((field.name, record_dtype(kind)))
+            # An empty record inside of an aligned one ends numpy 1.26 by a division by zero.
+            if record_dtype(kind).names:
+                fields.append((field.name, record_dtype(kind)))
             continue
         element, is_tuple, optional = split_type(kind)
         length = field.metadata["length"]

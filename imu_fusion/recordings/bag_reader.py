@@ -1,35 +1,52 @@
-"""Reading recordings: rosbag2 (MCAP, sqlite3) and ROS 1 bags.
+"""Reading recordings: rosbag2 (MCAP, sqlite3) and ROS 1 bags, whole or damaged.
 
-Goes through ``rosbags``; a file without its closing index (power loss, ``kill -9``) is read chunk
-by chunk with ``mcap``.
+One reader for each format (:mod:`~imu_fusion.recordings.mcap_storage`,
+:mod:`~imu_fusion.recordings.sqlite_storage`, :mod:`~imu_fusion.recordings.ros1_storage`) steps
+over what is damaged. The data files are what counts; metadata.yaml only says which of them belong
+together, and where it contradicts them it is said and not believed.
 """
 
-import struct
-from collections import Counter
+import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
 
-import mcap.exceptions
-import mcap.records
-import yaml
-from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.msg import normalize_msgtype
+import zstandard
 
-from imu_fusion.errors import BagError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, ParameterError, TopicError
 from imu_fusion.messages.typestore import TYPES
-from imu_fusion.recordings.qos import qos_profile
+from imu_fusion.parameters.bounded_yaml import read_yaml
+from imu_fusion.recordings.mcap_storage import McapStorage
+from imu_fusion.recordings.ros1_storage import Ros1Storage
+from imu_fusion.recordings.sqlite_storage import SqliteStorage
+from imu_fusion.recordings.storage import (
+    DamageError,
+    Part,
+    Storage,
+    StoredTopic,
+    in_order,
+    largest_chunk,
+    unpack,
+)
+from imu_fusion.recordings.targets import DATA_SUFFIXES, METADATA_FILE
+
+_STORAGES: dict[str, type[Storage]] = {
+    ".mcap": McapStorage, ".db3": SqliteStorage, ".bag": Ros1Storage}
+_PACKED = ".zstd"          # rosbag2's --compression-mode file
+_ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message of its --compression-mode message; CDR never does
+_LARGEST_RATIO = 1000      # of a file and what it unpacks to
+_PIECE = 1 << 20
 
 
 @dataclass
 class TopicInfo:
-    """One topic of a recording; ``count`` is None while it is not known."""
+    """One topic of a recording; ``count`` is what its index says, where it has one."""
 
     name: str
     msgtype: str
-    count: int | None
+    count: int
     qos_profiles: list[dict] = field(default_factory=list)
 
 
@@ -37,67 +54,130 @@ def open_bag(path: str | Path) -> "Reader":
     """Open a recording for reading: a context manager with ``topics`` and ``messages``.
 
     Args:
-        path: a rosbag2 directory, an ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
+        path: a rosbag2 directory, an ``.mcap`` or ``.db3`` file (also ``.mcap.zstd``,
+            ``.db3.zstd``), or a ROS 1 ``.bag``.
 
     Raises:
         BagError: nothing there, not a recording, or damaged beyond reading.
     """
     path = Path(path)
-    if not path.exists():
-        raise BagError(f"{path}: no such file or directory")
-    files, directory = _storage_files(path)
-    if all(f.stat().st_size == 0 for f in files):
-        raise BagError(f"{path}: the recording is empty (0 bytes); nothing was written to it")
+    reader = Reader(path)
     try:
-        return _IndexedReader(path, directory or files[0])
-    except (AnyReaderError, OSError, KeyError, ValueError, struct.error) as error:
-        if files[0].suffix != ".mcap":
+        try:
+            if not path.exists():
+                raise BagError(f"{path}: no such file or directory")
+            reader.open(_storage_files(path, reader.warnings))
+        except (OSError, ValueError) as error:    # ValueError: a name that no file can have
+            if isinstance(error, ImuFusionError):
+                raise
             raise BagError(f"{path}: cannot be read ({error})") from None
-        reason = error
-    reader = _RecoveringReader(path, files, reason)
-    if not reader.topics:
-        raise BagError(f"{path}: damaged, and no complete chunk could be recovered ({reason})")
+        except (MemoryError, RecursionError, ArithmeticError, LookupError, TypeError) as error:
+            raise BagError(f"{path}: damaged beyond reading ({type(error).__name__}: {error})"
+                           ) from error
+    except BaseException:
+        reader.close()
+        raise
     return reader
 
 
-def _storage_files(path):
-    """(the storage files, the rosbag2 directory if it has its metadata)."""
+def _storage_files(path: Path, warnings: list[str]) -> list[Path]:
+    """The files of a recording, in order; what is wrong with its metadata goes to ``warnings``."""
     if path.is_file():
-        if path.suffix not in (".mcap", ".db3", ".bag"):
+        if not path.name.endswith((*DATA_SUFFIXES, ".bag")):
             raise BagError(f"{path}: not a recording; expected a rosbag2 directory or a "
                            ".mcap, .db3 or .bag file")
-        return [path], None
-    for suffix in (".mcap", ".db3"):
-        files = sorted(path.glob(f"*{suffix}"), key=_split_index)
+        return [path]
+    for suffix in DATA_SUFFIXES:
+        files = sorted((p for p in path.iterdir() if p.name.endswith(suffix) and p.is_file()),
+                       key=_split_index)
         if files:
-            return files, path if (path / "metadata.yaml").exists() else None
+            return _named(path, files, warnings)
     raise BagError(f"{path}: a directory without .mcap or .db3 files is not a recording")
 
 
-def _split_index(path):
+def _split_index(path: Path) -> tuple[int, str]:
     """Order of the files of a split recording: by the number at their end, 2 before 10."""
-    number = path.stem.rpartition("_")[2]
-    return (int(number) if number.isdigit() else 0, path.name)
+    number = path.name.partition(".")[0].rpartition("_")[2]
+    return (int(number) if number.isdecimal() and len(number) < 19 else 0, path.name)
+
+
+def _named(path: Path, files: list[Path], warnings: list[str]) -> list[Path]:
+    """Those of the data files that metadata.yaml names; all of them, where it names none."""
+    if not (path / METADATA_FILE).exists():
+        return files
+    try:
+        said = read_yaml(path / METADATA_FILE)["rosbag2_bagfile_information"]
+        names = [PurePosixPath(str(name)).name for name in said["relative_file_paths"]]
+    except (ParameterError, KeyError, TypeError) as error:
+        why = str(error) if isinstance(error, ParameterError) else "no metadata of rosbag2"
+        warnings.append(f"{METADATA_FILE} is not used: {why.removeprefix(f'{path}/')}")
+        return files
+    known = {file.name for file in files}
+    missing = sorted(set(names) - known)
+    if missing:
+        warnings.append(f"{METADATA_FILE} names {', '.join(missing[:5])}, which "
+                        f"{'is' if len(missing) == 1 else 'are'} not there; read is what is there")
+        return files
+    left_out = sorted(known - set(names))
+    if left_out:
+        warnings.append(f"{', '.join(left_out[:5])} is not named in {METADATA_FILE} and is left "
+                        "out; it can be read by its own name")
+    return [file for file in files if file.name in names] or files
 
 
 class Reader:
-    """What every reader offers; ``warnings`` says what is wrong with the recording."""
+    """A recording; ``warnings`` says what is wrong with it, as far as it is known by now: what is
+    damaged inside is found while it is read. ``damaged`` tells whether anything is lost."""
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.topics: dict[str, TopicInfo] = {}
         self.start_time = self.end_time = 0
         self.warnings: list[str] = []
-        self.typestore = TYPES
+        self.damaged = False    # messages are lost
+        self._storages: list[Storage] = []
+        self._stored: dict[str, StoredTopic] = {}
+        self._temporary: list[Any] = []
 
     def __enter__(self) -> "Reader":
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.close()
+
+    def open(self, files: list[Path]) -> None:
+        """Open the files of the recording; see :func:`open_bag`."""
+        if all(file.stat().st_size == 0 for file in files):
+            raise BagError(f"{self.path}: the recording is empty (0 bytes); nothing was written "
+                           "to it")
+        for file in files:
+            if file.stat().st_size == 0:
+                self.lose(f"{file.name} is empty (0 bytes)")
+                continue
+            plain = self._plain(file) if file.suffix == _PACKED else file
+            storage = _STORAGES[plain.suffix](plain, self.lose, self.mention)
+            self._storages.append(storage)
+            self._add(storage)
+        times = [time for storage in self._storages for time in storage.times or ()]
+        if times:
+            self.start_time, self.end_time = min(times), max(times) + 1
+        left_out = list(dict.fromkeys(n for s in self._storages for n in s.left_out))
+        if not self.topics and left_out:
+            raise BagError(f"{self.path}: no topics of ROS 2 that can be read; it has "
+                           f"{_listing(left_out)}")
+        if left_out:
+            self.warnings.append(f"no topics of ROS 2, left out: {_listing(left_out)}")
+        if not self.topics and self.damaged:
+            raise BagError(f"{self.path}: damaged, and nothing could be recovered "
+                           f"({'; '.join(self.warnings)})")
 
     def close(self) -> None:
         """Release the files."""
+        for storage in self._storages:
+            storage.close()
+        for file in self._temporary:
+            file.close()
+        self._storages, self._temporary = [], []
 
     def messages(self, topics: Collection[str] | None = None, start: int | None = None,
                  stop: int | None = None) -> Iterator[tuple[str, str, int, bytes]]:
@@ -106,13 +186,34 @@ class Reader:
         Args:
             topics: names to yield; None for all.
             start, stop: bounds of the log time, start inclusive, stop exclusive.
+
+        Raises:
+            BagError: the file can no longer be read. What is damaged in it is no error but left
+                out: see ``warnings``.
         """
-        raise NotImplementedError
+        wanted = {name for name in self.topics if topics is None or name in topics}
+        parts = [Part(storage.times[0] if storage.times else 0, 0,
+                      partial(storage.messages, wanted, start, stop))
+                 for storage in self._storages]
+        rows = in_order(parts) if len(parts) > 1 else parts[0].rows()
+        try:
+            for log_time, topic, data in rows:
+                if data[:4] == _ZSTD:
+                    unpacked = self._unpacked(topic, data)
+                    if unpacked is None:
+                        continue
+                    data = unpacked
+                yield topic, self.topics[topic].msgtype, log_time, data
+        except ImuFusionError:
+            raise
+        except Exception as error:
+            raise BagError(f"{self.path}: damaged beyond reading ({type(error).__name__}: {error})"
+                           ) from error
 
     @property
     def count(self) -> int:
         """Number of messages."""
-        return sum(info.count or 0 for info in self.topics.values())
+        return sum(info.count for info in self.topics.values())
 
     def require(self, name: str, msgtype: str | None = None) -> TopicInfo:
         """The TopicInfo of ``name`` (with or without leading slash), or a TopicError."""
@@ -125,10 +226,82 @@ class Reader:
             raise TopicError(f"{self.path}: topic '{name}' is {info.msgtype}, expected {msgtype}")
         return info
 
-    def definition(self, msgtype: str) -> tuple[str, str]:
-        """(ros2msg definition with its dependencies, RIHS01 hash) of a type in this recording."""
-        return self.typestore.generate_msgdef(msgtype, ros_version=2)[0], \
-            self.typestore.hash_rihs01(msgtype)
+    def definition(self, topic: str) -> tuple[str, str] | None:
+        """(ros2msg definition with its dependencies, RIHS01 hash) of the type of a topic, as the
+        recording has it, else as ROS 2 Jazzy does; None if neither knows it."""
+        info = self._stored[topic]
+        if info.definition is None and info.msgtype in TYPES.fielddefs:
+            info.definition = (TYPES.generate_msgdef(info.msgtype, ros_version=2)[0],
+                               TYPES.hash_rihs01(info.msgtype))
+        return info.definition
+
+    def _add(self, storage: Storage) -> None:
+        """The topics of one more file."""
+        for name, stored in storage.topics.items():
+            # Line breaks and escapes would speak to the terminal.
+            if not (name.isprintable() and stored.msgtype.isprintable()):
+                storage.left_out.append(f"{ascii(name)} ({ascii(stored.msgtype)})")
+                continue
+            info = self.topics.get(name)
+            if info is None:
+                self._stored[name] = stored
+                self.topics[name] = TopicInfo(name, stored.msgtype, stored.count,
+                                              stored.qos_profiles)
+            elif info.msgtype == stored.msgtype:
+                info.count += stored.count
+            else:
+                self.lose(f"{storage.path.name}: topic {name} is {stored.msgtype} there, and "
+                           f"{info.msgtype} in other files; read as the latter")
+
+    def lose(self, text: str) -> None:
+        """Say, once, that a part of the recording cannot be used."""
+        self.damaged = True
+        self.mention(text)
+
+    def mention(self, text: str) -> None:
+        """Say something, once, that costs no message."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    def _plain(self, file: Path) -> Path:
+        """A temporary unpacked copy of a file that was compressed as a whole."""
+        temporary = tempfile.NamedTemporaryFile(  # noqa: SIM115, closed by close
+            suffix="".join(file.suffixes[-2:]).removesuffix(_PACKED))
+        self._temporary.append(temporary)
+        bound = max(_LARGEST_RATIO * file.stat().st_size, largest_chunk())
+        size = 0
+        try:
+            with (open(file, "rb") as stream,
+                  zstandard.ZstdDecompressor().stream_reader(stream) as unpacked):
+                while data := unpacked.read(_PIECE):
+                    size += len(data)
+                    if size > bound:
+                        raise BagError(f"{file}: unpacks to more than {_LARGEST_RATIO} times its "
+                                       "size; unpack it yourself (zstd -d) if that is right")
+                    temporary.write(data)
+        except zstandard.ZstdError as error:
+            self.lose(f"{file.name}: damaged ({error}); what unpacks before is read")
+        temporary.flush()
+        if not size:
+            raise BagError(f"{file}: cannot be unpacked, it is no zstd file or damaged at its "
+                           "beginning")
+        return Path(temporary.name)
+
+    def _unpacked(self, topic: str, data: bytes) -> bytes | None:
+        """A message that was compressed by itself; None, and a warning, if it is broken."""
+        try:
+            size = zstandard.frame_content_size(data)
+            if size < 0:
+                raise DamageError("its size is not stated")
+            return unpack(data, "zstd", size)
+        except (DamageError, zstandard.ZstdError) as error:
+            self.lose(f"topic {topic}: compressed messages are broken and left out ({error})")
+            return None
+
+
+def _listing(names: list[str]) -> str:
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return ", ".join(name[:120] for name in names[:5]) + more
 
 
 def find_topic(names: Iterable[str], wanted: str) -> str | None:
@@ -139,132 +312,3 @@ def find_topic(names: Iterable[str], wanted: str) -> str | None:
     return None
 
 
-class _IndexedReader(Reader):
-    """A complete recording, through rosbags."""
-
-    def __init__(self, path, source):
-        super().__init__(path)
-        self._reader = AnyReader([source], default_typestore=TYPES)
-        self._reader.open()
-        try:
-            self._is_ros1 = not self._reader.is2
-            if not self._is_ros1:
-                self.typestore = self._reader.typestore
-            for name, info in self._reader.topics.items():
-                if info.msgtype is None:
-                    kinds = sorted({c.msgtype for c in info.connections})
-                    self.warnings.append(f"topic {name} holds several types ({', '.join(kinds)}) "
-                                         "and is left out")
-                    continue
-                qos = [] if self._is_ros1 else _qos_of(info.connections[0])
-                self.topics[name] = TopicInfo(name, info.msgtype, info.msgcount, qos)
-            if any(info.count for info in self.topics.values()):
-                self.start_time = self._reader.start_time
-                self.end_time = self._reader.end_time
-        except BaseException:
-            self._reader.close()
-            raise
-
-    def close(self):
-        self._reader.close()
-
-    def messages(self, topics=None, start=None, stop=None):
-        wanted = self.topics if topics is None else topics
-        connections = [c for c in self._reader.connections
-                       if c.topic in wanted and c.topic in self.topics]
-        if not connections:
-            return
-        try:
-            for connection, log_time, data in self._reader.messages(connections, start, stop):
-                if self._is_ros1:
-                    data = bytes(TYPES.ros1_to_cdr(data, connection.msgtype))
-                yield connection.topic, connection.msgtype, log_time, data
-        except KeyError as error:
-            raise BagError(f"{self.path}: type {error} is not known; only ROS 2 Jazzy's own types "
-                           "can be read from a ROS 1 bag") from None
-        except Exception as error:
-            if isinstance(error, (AnyReaderError, OSError, struct.error, ValueError,
-                                  AssertionError)) or "Error" in type(error).__name__:
-                raise BagError(f"{self.path}: damaged while reading ({error}); "
-                               "try imu_fusion info --repair") from error
-            raise
-
-
-def _qos_of(connection):
-    return [qos_profile(q.depth, q.reliability.name.lower(), q.durability.name.lower(),
-                        q.history.name.lower())
-            for q in getattr(connection.ext, "offered_qos_profiles", [])]
-
-
-class _RecoveringReader(Reader):
-    """MCAP files without a usable index: every complete chunk, in the order of the file."""
-
-    def __init__(self, path, files, reason):
-        super().__init__(path)
-        self._files = files
-        counts: Counter[str] = Counter()
-        times = []
-        for topic, _, log_time, _ in self._scan():
-            counts[topic] += 1
-            times.append(log_time)
-        for name, info in self.topics.items():
-            info.count = counts[name]
-        if times:
-            self.start_time, self.end_time = min(times), max(times) + 1
-        self.warnings.append(f"not closed properly ({reason}); {len(times)} messages recovered "
-                             "from its complete chunks; imu_fusion info --repair writes a clean "
-                             "copy")
-
-    def _scan(self):
-        """Yield (topic, msgtype, log time, CDR bytes) as far as each file can be read: the open
-        chunk at its end is lost."""
-        for path in self._files:
-            with open(path, "rb") as stream:
-                try:
-                    yield from self._scan_file(stream)
-                except (mcap.exceptions.McapError, EOFError, struct.error, ValueError,
-                        RuntimeError):
-                    continue
-                except Exception as error:  # decompressors raise types of their own
-                    if "zstd" not in repr(type(error)).lower() and "lz4" not in repr(error).lower():
-                        raise
-
-    def _scan_file(self, stream):
-        schemas, channels = {}, {}
-        for record in StreamReader(stream, validate_crcs=True).records:
-            if isinstance(record, mcap.records.Schema):
-                schemas[record.id] = record
-            elif isinstance(record, mcap.records.Channel):
-                channels[record.id] = self._register(record, schemas)
-            elif isinstance(record, mcap.records.Message):
-                topic = channels.get(record.channel_id)
-                if topic is not None:
-                    yield topic, self.topics[topic].msgtype, record.log_time, record.data
-
-    def _register(self, channel, schemas):
-        schema = schemas.get(channel.schema_id)
-        if schema is None or channel.message_encoding != "cdr":
-            return None
-        if channel.topic not in self.topics:
-            msgtype = normalize_msgtype(schema.name)
-            self.topics[channel.topic] = TopicInfo(channel.topic, msgtype, None, yaml.safe_load(
-                channel.metadata.get("offered_qos_profiles", "")) or [])
-            if msgtype not in TYPES.fielddefs and schema.encoding == "ros2msg":
-                self._learn(msgtype, schema)
-        return channel.topic
-
-    def _learn(self, msgtype, schema):
-        if self.typestore is TYPES:
-            self.typestore = get_typestore(Stores.ROS2_JAZZY)
-        known = get_types_from_msg(schema.data.decode("utf-8", "replace"), msgtype)
-        self.typestore.register({k: v for k, v in known.items()
-                                 if k not in self.typestore.fielddefs})
-
-    def messages(self, topics=None, start=None, stop=None):
-        rows = [(log_time, i, topic, msgtype, data)
-                for i, (topic, msgtype, log_time, data) in enumerate(self._scan())
-                if (topics is None or topic in topics)
-                and (start is None or log_time >= start) and (stop is None or log_time < stop)]
-        rows.sort(key=lambda row: row[:2])
-        for log_time, _, topic, msgtype, data in rows:
-            yield topic, msgtype, log_time, data

@@ -11,7 +11,6 @@ from collections import Counter
 from pathlib import Path
 
 import yaml
-from rosbags.typesys.store import Typestore
 
 from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
@@ -42,7 +41,6 @@ class BagWriter:
         chunk_size: bytes of messages per chunk.
         overwrite: replace what is there, if it is a recording and nothing else.
         whole: see above; leaving the context by an exception leaves everything as it was.
-        typestore: source of message definitions; Jazzy's by default.
 
     Raises:
         BagError: the directory is in the way or cannot be written.
@@ -50,13 +48,12 @@ class BagWriter:
 
     def __init__(self, directory: str | Path, compression: str = "zstd",
                  chunk_size: int = 256 * 1024, overwrite: bool = False,
-                 typestore: Typestore = TYPES, whole: bool = False):
+                 whole: bool = False):
         self._target = Path(directory).resolve()
         self.directory = self._target
         self._replaced: Path | None = None    # where what was there is kept until the end
         self._whole = whole
         self.counts: Counter[str] = Counter()
-        self._typestore = typestore
         self._channels: dict[str, int] = {}
         self._topics: dict[str, dict] = {}
         self._prepare(overwrite)
@@ -144,10 +141,10 @@ class BagWriter:
                            f"'/{topic}'")
         qos = [qos_profile()] if qos is None else qos
         if definition is None:
-            if msgtype not in self._typestore.fielddefs:
+            if msgtype not in TYPES.fielddefs:
                 raise BagError(f"topic {topic}: the definition of its type {msgtype} is not known")
-            definition = (self._typestore.generate_msgdef(msgtype, ros_version=2)[0],
-                          self._typestore.hash_rihs01(msgtype))
+            definition = (TYPES.generate_msgdef(msgtype, ros_version=2)[0],
+                          TYPES.hash_rihs01(msgtype))
         text, digest = definition
         schema = self._writer.add_schema(msgtype, "ros2msg", text.encode())
         self._channels[topic] = self._writer.add_channel(

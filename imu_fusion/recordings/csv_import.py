@@ -18,8 +18,9 @@ The result is a recording and a parameter file of the acceleration field estimat
 
 import csv
 import os
+import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,11 @@ ACCELERATION_UNITS = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
 RATE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 _DELIMITERS = {"tab": "\t", "space": None}
 _SENSOR_AXES = ("x", "y", "z")
+# Python's own numbers would also be 1_0 and digits of other scripts.
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_NOT_FINITE = ("nan", "inf", "-inf", "+inf")
+_LATEST = 2**31 - 1    # seconds since 1970 in builtin_interfaces/Time
+_DIGITS = 22           # of nanoseconds, with room
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,8 @@ class TimeParams(Parameters):
     column: str | None = param(None, doc="Column of the times; without one, give the rate.")
     unit: str = param("s", choices=tuple(TIME_UNITS), doc="Unit of the times.")
     start: float = param(
-        0.0, unit="s", low=0.0, doc="Added to the times. Give the Unix time of their zero.")
+        0.0, unit="s", low=0.0, high=float(_LATEST),
+        doc="Added to the times. Give the Unix time of their zero.")
     rate: float | None = param(
         None, unit="Hz", low=1e-3, doc="Rate of the rows, if the table has no times.")
 
@@ -226,8 +233,10 @@ def _read_table(source, params, columns):
     """(stamps (n,) int64, dict of column to (n,) float64, NaN for empty cells) of a table."""
     try:
         with open(source, newline="", encoding="utf-8-sig") as stream:
-            for _ in range(params.skip_lines):
-                stream.readline()
+            for number in range(params.skip_lines):
+                if not stream.readline():
+                    raise SampleError(f"{source}: has {number} lines, fewer than the "
+                                      f"{params.skip_lines} of skip_lines")
             delimiter = _DELIMITERS.get(params.delimiter, params.delimiter)
             lines = (csv.reader(stream, delimiter=delimiter) if delimiter is not None
                      else (line.split() for line in stream))
@@ -251,10 +260,19 @@ def _read_table(source, params, columns):
     table = {name: np.array([read_number(source, number, name, row, names.index(name))
                              for number, row in rows]) for name in columns}
     if params.time.column is None:
+        last = params.time.start + len(rows) / params.time.rate
+        if last > _LATEST:
+            raise SampleError(f"{source}: {len(rows)} rows at {params.time.rate:g} Hz end at "
+                              f"{last:g} s, which no stamp of ROS can hold (at most {_LATEST} s)")
         since = np.round(np.arange(len(rows)) * (NANOSECONDS / params.time.rate))
         return since.astype(np.int64) + round(params.time.start * NANOSECONDS), table
     place = names.index(params.time.column)
-    stamps = np.array([_stamp(source, number, row, place, params) for number, row in rows])
+    times = [_stamp(source, number, row, place, params) for number, row in rows]
+    if max(times) > _LATEST * NANOSECONDS:
+        raise SampleError(f"{source}: column '{params.time.column}' ends at "
+                          f"{max(times) / NANOSECONDS:g} s, which no stamp of ROS can hold (at "
+                          f"most {_LATEST} s): is time.unit right?")
+    stamps = np.array(times, dtype=np.int64)
     if stamps.min() < 0:
         raise SampleError(f"{source}: column '{params.time.column}' begins at "
                           f"{stamps.min() * 1e-9:g} s; stamps cannot be negative: give time.start")
@@ -270,22 +288,25 @@ def _cell(source, line, name, row, place):
 def read_number(source: str | Path, line: int, name: str, row: list[str], place: int) -> float:
     """The number in cell ``place`` of a row, NaN if empty; SampleError names what it is not."""
     text = _cell(source, line, name, row, place)
-    try:
-        return float(text) if text else np.nan
-    except ValueError:
-        raise SampleError(f"{source}, line {line}, column '{name}': '{text}' is not a number"
-                          ) from None
+    if not text:
+        return np.nan
+    if not _NUMBER.fullmatch(text) and text.lower() not in _NOT_FINITE:
+        raise SampleError(f"{source}, line {line}, column '{name}': '{text[:40]}' is not a number")
+    return float(text)
 
 
 def _stamp(source, line, row, place, params):
     text = _cell(source, line, params.time.column, row, place)
     try:
         # Seconds since 1970 exceed what a float tells apart in nanoseconds.
-        since = Decimal(text).scaleb(TIME_UNITS[params.time.unit])
-        return int(since.to_integral_value()) + round(params.time.start * NANOSECONDS)
-    except (InvalidOperation, ValueError, OverflowError):
-        raise SampleError(f"{source}, line {line}, column '{params.time.column}': '{text}' is "
-                          "not a time") from None
+        since = Decimal(text if _NUMBER.fullmatch(text) else "").scaleb(
+            TIME_UNITS[params.time.unit])
+        if since.adjusted() < _DIGITS:    # before digits are made of an exponent
+            return int(since.to_integral_value()) + round(params.time.start * NANOSECONDS)
+    except (ArithmeticError, ValueError):
+        pass
+    raise SampleError(f"{source}, line {line}, column '{params.time.column}': '{text[:40]}' is "
+                      "not a time")
 
 
 def _changed(params):

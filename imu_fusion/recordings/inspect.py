@@ -1,20 +1,21 @@
 """What is in a recording, topic by topic: rates, gaps, ranges, and what looks wrong."""
 
 import struct
+from array import array
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from imu_fusion.errors import MessageError
 from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.layouts import NANOSECONDS
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
 from imu_fusion.recordings.bag_reader import Reader
-from imu_fusion.recordings.logs import read_log
+from imu_fusion.recordings.logs import LogCollector, undecodable
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 from imu_fusion.samples.logs import Log
 
-_HEADER = "std_msgs/msg/Header"
+_HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
+_LATEST = 2**63 - 1    # of log times, which MCAP counts to twice as far
 
 
 @dataclass(frozen=True)
@@ -78,16 +79,28 @@ def inspect_topics(reader: Reader) -> list[TopicReport]:
     Returns:
         list of TopicReport, in order of their names.
     """
-    reports = []
-    for name, info in sorted(reader.topics.items()):
-        if info.msgtype in SAMPLE_TYPES and info.count:
-            try:
-                report = inspect_log(name, info.msgtype, read_log(reader, name))
-            except MessageError as error:
-                report = TopicReport(name, info.msgtype, np.empty(0, np.int64), (), (
-                    checks.Finding("type", f"{name}: {error}"),))
+    collectors: dict[str, LogCollector | _Stamps] = {
+        name: LogCollector(SAMPLE_TYPES[info.msgtype]) if info.msgtype in SAMPLE_TYPES
+        else _Stamps(_begins_with_header(reader.definition(name)))
+        for name, info in sorted(reader.topics.items())}
+    for topic, _, log_time, cdr in reader.messages():
+        collector = collectors[topic]
+        if isinstance(collector, LogCollector):
+            collector.add(cdr)
         else:
-            report = _inspect_stamps(reader, name, info)
+            collector.add(log_time, cdr)
+    reports = []
+    for name, collector in collectors.items():
+        msgtype = reader.topics[name].msgtype
+        if isinstance(collector, LogCollector):
+            report = inspect_log(name, msgtype, collector.log())
+            if collector.refused:
+                text = undecodable(name, collector.refused)
+                reader.lose(text)
+                report = replace(report, findings=(checks.Finding("type", text),
+                                                   *report.findings))
+        else:
+            report = collector.report(name, msgtype)
         reports.append(report)
     imus = [report.log for report in reports if isinstance(report.log, ImuLog)]
     return [_with_axes(report, imus) for report in reports]
@@ -128,22 +141,34 @@ def _with_axes(report, imus):
                                      *checks.check_axes(imus[0], report.log, report.topic)))
 
 
-def _inspect_stamps(reader, name, info):
-    """TopicReport of a topic whose contents are not looked at."""
-    fields = reader.typestore.fielddefs.get(info.msgtype, ((), ()))[1]
-    stamped = bool(fields) and fields[0][1][1] == _HEADER
-    times = []
-    for _, _, log_time, cdr in reader.messages([name]):
-        if stamped and len(cdr) >= 12:
+class _Stamps:
+    """Stamps of a topic whose contents are not looked at: of its headers, if it has them."""
+
+    def __init__(self, stamped: bool) -> None:
+        self._stamped = stamped
+        self._times = array("q")
+
+    def add(self, log_time: int, cdr: bytes) -> None:
+        if self._stamped and len(cdr) >= 12:
             sec, nanosec = struct.unpack_from("<iI" if cdr[1] else ">iI", cdr, 4)
-            times.append(sec * NANOSECONDS + nanosec)
-        else:
-            times.append(log_time)
-    stamps = np.array(times, dtype=np.int64)
-    # Messages without a header, or about changes, are sent at any time: gaps mean nothing.
-    findings = [finding for finding in checks.check_stamps(stamps, name)
-                if stamped and (finding.kind != "gap" or info.msgtype != FLAGS_TYPE)]
-    return TopicReport(name, info.msgtype, stamps, (), tuple(findings), stamped)
+            log_time = sec * NANOSECONDS + nanosec
+        self._times.append(min(log_time, _LATEST))
+
+    def report(self, name: str, msgtype: str) -> TopicReport:
+        stamps = np.array(self._times, dtype=np.int64)
+        # Messages without a header, or about changes, are sent at any time: gaps mean nothing.
+        findings = [finding for finding in checks.check_stamps(stamps, name)
+                    if self._stamped and (finding.kind != "gap" or msgtype != FLAGS_TYPE)]
+        return TopicReport(name, msgtype, stamps, (), tuple(findings), self._stamped)
+
+
+def _begins_with_header(definition):
+    """Whether the first field of a definition in ros2msg is a std_msgs/Header."""
+    for line in definition[0].splitlines() if definition else ():
+        words = line.partition("#")[0].split()
+        if words and not any("=" in word for word in words):
+            return words[0] in _HEADERS
+    return False
 
 
 def _norm(vectors):

@@ -1,16 +1,67 @@
-"""One topic of a recording as a typed log."""
+"""Topics of a recording as typed logs, decoded while they are read."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from imu_fusion.errors import TopicError
-from imu_fusion.messages.convert import SAMPLE_TYPES
+from imu_fusion.messages.convert import SAMPLE_TYPES, SampleType
 from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.samples.logs import Log
+
+_BLOCK = 2000    # messages that are decoded at once
+
+
+class LogCollector:
+    """Makes a log of the messages of one topic, keeping samples and not messages.
+
+    ``refused`` maps reasons for which messages could not be decoded to how many there were.
+    """
+
+    def __init__(self, kind: SampleType) -> None:
+        self._kind = kind
+        self._waiting: list[bytes] = []
+        self._stamps = [np.empty(0, np.int64)]
+        self._values = [np.empty((0, kind.width))]
+        self._frame_id: str | None = None
+        self.refused: dict[str, int] = {}
+
+    def add(self, cdr: bytes) -> None:
+        """Take one message."""
+        self._waiting.append(cdr)
+        if len(self._waiting) >= _BLOCK:
+            self._decode()
+
+    def log(self) -> Log:
+        """The log of all messages that could be decoded."""
+        self._decode()
+        return self._kind.log(np.concatenate(self._stamps), np.concatenate(self._values),
+                              self._frame_id or "")
+
+    def _decode(self) -> None:
+        block = self._kind.layout.decode_block(self._waiting)
+        self._waiting = []
+        for reason in block.refused.values():
+            self.refused[reason] = self.refused.get(reason, 0) + 1
+        if len(block.stamp):
+            self._stamps.append(block.stamp)
+            self._values.append(self._kind.values(block.values))
+            if self._frame_id is None:
+                self._frame_id = block.frame_ids[0]
+
+
+def undecodable(topic: str, refused: Mapping[str, int]) -> str:
+    """Words for messages that could not be decoded."""
+    reason = next(iter(refused))
+    return (f"{topic}: {sum(refused.values())} messages cannot be decoded and are left out "
+            f"({reason})")
 
 
 def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = None) -> Any:
     """The log of one topic of an open recording: which subclass of Log, its type decides.
+
+    Messages that do not fit their type are left out; ``reader.warnings`` says so.
 
     Args:
         reader: what :func:`imu_fusion.recordings.bag_reader.open_bag` returned.
@@ -20,11 +71,22 @@ def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = 
 
     Raises:
         TopicError: no such topic, or a type that has no log.
-        MessageError: bytes that do not fit the type.
     """
     info = reader.require(topic)
-    if log_of is None and info.msgtype not in SAMPLE_TYPES:
+    kind = SAMPLE_TYPES.get(info.msgtype)
+    if kind is None:
         raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
                          f"logs exist for {', '.join(sorted(SAMPLE_TYPES))}")
-    log_of = log_of or SAMPLE_TYPES[info.msgtype].read
-    return log_of([cdr for *_, cdr in reader.messages([info.name])])
+    if log_of is not None:
+        messages = [cdr for *_, cdr in reader.messages([info.name])]
+        refused = kind.layout.decode_block(messages).refused
+        if refused:
+            reader.lose(undecodable(info.name, dict.fromkeys(refused.values(), len(refused))))
+        return log_of([cdr for i, cdr in enumerate(messages) if i not in refused])
+    collector = LogCollector(kind)
+    for *_, cdr in reader.messages([info.name]):
+        collector.add(cdr)
+    log = collector.log()
+    if collector.refused:
+        reader.lose(undecodable(info.name, collector.refused))
+    return log

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 RESULTS_FILE = "results.json"
+LEFT_OUT, RECORDING = "left_out", "recording"    # what was not used, of the nodes and as a whole
+UNDECODABLE = "cannot be decoded"
 
 
 def write_results(directory: str | Path, found: Mapping[str, Mapping]) -> None:
@@ -18,6 +20,14 @@ def read_results(directory: str | Path) -> dict | None:
     """What nodes found, None without such a file."""
     file = Path(directory) / RESULTS_FILE
     return json.loads(file.read_text()) if file.exists() else None
+
+
+def is_incomplete(directory: str | Path) -> bool:
+    """Whether messages of the recording were lost: damaged parts, messages that are broken. What
+    a sensor repeats or reports as absent is left out, too, but not lost."""
+    left_out = (read_results(directory) or {}).get(LEFT_OUT, {})
+    return RECORDING in left_out or any(
+        UNDECODABLE in reasons for topics in left_out.values() for reasons in topics.values())
 
 
 def _plain(value):

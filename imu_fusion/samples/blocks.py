@@ -3,14 +3,18 @@
 In a replay and in batch merging is strict: a sample is released once every topic of the session
 has passed its stamp or has ended, so what comes out depends on stamps alone, never on arrival or
 on how the samples were cut into blocks. Live, all that has come is released at once.
+
+When a clock is set back, a topic that is too slow to show it (a fix a second, a clock set back by
+half of one) follows the first of the topics that have one clock: what is later than the end of
+that one's epoch belongs to the next. It is given ``JUMP`` to show the jump itself.
 """
 
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.samples.guard import Guard, Verdict, fit_for_use
+from imu_fusion.samples.guard import JUMP, Guard, Judged, Verdict
 
 Samples = tuple[np.ndarray, np.ndarray]
 """Stamps (n,) int64 ns, ascending, and values (n, k) of one topic."""
@@ -41,13 +45,17 @@ class BlockMerger:
         topics: names, in order of rank at equal stamps.
         widths: how many numbers a sample of each has.
         refused: called with (topic, stamps, list of Verdict) of what its guard has refused.
+        one_clock: topics whose sensors share a clock, the one that others follow first; None:
+            all of them, and none follows.
     """
 
     def __init__(self, topics: Mapping[str, int],
-                 refused: Callable[[str, np.ndarray, list[Verdict]], object] = lambda *_: None
-                 ) -> None:
+                 refused: Callable[[str, np.ndarray, list[Verdict]], object] = lambda *_: None,
+                 one_clock: Collection[str] | None = None) -> None:
         self._widths = dict(topics)
         self._refused = refused
+        self._one_clock = one_clock
+        self._leader = next(iter(one_clock or ()), None)
         self.begin(None)
 
     def begin(self, session_topics: Container[str] | None) -> None:
@@ -57,7 +65,8 @@ class BlockMerger:
         """
         named = session_topics or ()
         self.strict = session_topics is not None
-        self.guards = {topic: Guard() for topic in self._widths}
+        self.guards = {topic: Guard(self._one_clock is None or topic in self._one_clock)
+                       for topic in self._widths}
         self._epoch = 0
         self._open = {topic for topic in self._widths if topic in named}
         self._waiting = {topic: _Waiting(width) for topic, width in self._widths.items()}
@@ -65,20 +74,37 @@ class BlockMerger:
     def add(self, blocks: Mapping[str, Samples]) -> list[Segment]:
         """Take samples in order of arrival within each topic; return what may be used now."""
         for topic, (stamp, values) in blocks.items():
-            verdicts, epochs = self.guards[topic].check_block(stamp, values)
-            if verdicts is not None:
-                keep = fit_for_use(verdicts, len(stamp))
-                if not keep.all():
-                    self._refused(topic, stamp[~keep],
-                                  [v for v in verdicts if v is not Verdict.OK])
-                    stamp, values, epochs = stamp[keep], values[keep], epochs[keep]
-            self._waiting[topic].append(stamp, epochs, values)
+            self._wait(topic, self.guards[topic].take(stamp, values))
         return self._release()
 
     def end(self, topics: Iterable[str]) -> list[Segment]:
         """Nothing more comes on these topics; return what that releases."""
-        self._open.difference_update(topics)
+        for topic in topics:
+            self._wait(topic, self.guards[topic].finish())
+            self._open.discard(topic)
         return self._release()
+
+    def _wait(self, topic: str, judged: Judged) -> None:
+        if judged.verdicts:
+            self._refused(topic, np.array(judged.refused_stamps), judged.verdicts)
+        self._waiting[topic].append(judged.stamp, judged.epochs, judged.values)
+
+    def _follow(self) -> None:
+        """Let topics that did not see the clock set back follow the one that did."""
+        if self._leader is None:
+            return
+        ends = self.guards[self._leader].ends
+        for topic, guard in self.guards.items():
+            waiting = self._waiting[topic]
+            while topic != self._leader and len(waiting.stamp):
+                late = np.zeros(len(waiting.stamp), dtype=bool)
+                for epoch, end in ends.items():
+                    late |= (waiting.epochs == epoch) & (waiting.stamp > end + JUMP)
+                if not late.any():
+                    break
+                waiting.epochs = waiting.epochs.copy()
+                waiting.epochs[int(np.argmax(late)):] += 1
+                guard.epoch += 1
 
     @property
     def held(self) -> int:
@@ -86,6 +112,7 @@ class BlockMerger:
         return sum(len(waiting.stamp) for waiting in self._waiting.values())
 
     def _release(self) -> list[Segment]:
+        self._follow()
         bound = self._bound()
         taken = {topic: waiting.take(bound) for topic, waiting in self._waiting.items()}
         segments = []
@@ -103,7 +130,7 @@ class BlockMerger:
             # The other topics' clocks were set back too, seen yet or not.
             for guard in self.guards.values():
                 if guard.epoch < self._epoch:
-                    guard.epoch, guard.last = self._epoch, None
+                    guard.join(self._epoch)
         return segments
 
     def _bound(self) -> tuple[int, int] | None:

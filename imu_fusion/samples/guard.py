@@ -1,15 +1,22 @@
 """Which samples are fit for use: one rule for live nodes, replay and batch.
 
-A sample is refused, and counted, if a value is not finite, if its stamp repeats
-the last one of its topic, or if its stamp is older than that by at most
-``JUMP_BACK`` (it was overtaken on the way). An older stamp than that means that
-the clock was set back (a simulation or a replay starts over): a new *epoch*
-begins, and estimators start anew with it.
+A sample is refused, and counted, if a value is not finite or its stamp is below zero, if it
+repeats what has been taken, or if it was *overtaken* on the way: it is older than the last one and
+fills a hole of at most ``JUMP`` that the others have left. Every other stamp that does not follow
+the last one is a jump, and one sample is no proof of it: the sample is held back until those after
+it tell a clock that was set from a stamp that is wild.
+
+- Set *back*, by however little: samples come again for times that have been measured already. The
+  same true time has two stamps then, and none of them says how much time has passed: a new
+  *epoch* begins, and estimators start anew with it.
+- Set *ahead*: a gap, over which estimators predict; beyond ``OTHER_CLOCK`` a new epoch, too.
+
+All of this follows from the sequence of the samples of a topic alone, not from when they come.
 """
 
 import enum
 from collections import Counter
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,8 +24,18 @@ from imu_fusion.samples.logs import Log
 
 AnyLog = TypeVar("AnyLog", bound=Log)
 
-JUMP_BACK = 1_000_000_000
-"""Nanoseconds. Transport delays reorder samples by less, restarts go back by more."""
+JUMP = 1_000_000_000
+"""Nanoseconds. Transport delays reorder samples by less, sensors pause for less."""
+
+OTHER_CLOCK = 7 * 86400 * 1_000_000_000
+"""Nanoseconds. No recording pauses for so long; a computer that boots without a clock jumps by
+more."""
+
+_SLOW = 5          # usual intervals: what is ahead by no more is no jump, of slow sensors
+_AGREEING = 3      # samples in a row that make a clock that was set back
+_HOLE = 1.5        # usual intervals: a longer one has lost a sample
+_UNPROVEN = 3600 * 1_000_000_000    # a pause before the very last sample may be as long
+_PARTS = 64        # after how many parts the latest samples are put together
 
 
 class Verdict(enum.Enum):
@@ -26,77 +43,221 @@ class Verdict(enum.Enum):
 
     OK = "ok"
     NOT_FINITE = "not finite (NaN, infinite or absent)"
+    NEGATIVE = "stamp below zero"
     DUPLICATE = "repeated stamp"
     BACKWARDS = "stamp older than the one before"
+    WILD = "stamp far from those before and after"
+
+
+class Judged(NamedTuple):
+    """Samples fit for use: ``stamp`` (n,), ``values`` (n, k), ``epochs`` (n,); and the stamps and
+    Verdicts of what was refused."""
+
+    stamp: np.ndarray
+    values: np.ndarray
+    epochs: np.ndarray
+    refused_stamps: list[int]
+    verdicts: list[Verdict]
 
 
 class Guard:
-    """The rule for one topic; ``epoch`` counts the clock's jumps back."""
+    """The rule for one topic.
 
-    def __init__(self) -> None:
-        self.epoch = 0
-        self.last: int | None = None
+    Args:
+        small_jumps: whether a clock that is set back by less than ``JUMP`` is looked for; without,
+            such samples are refused as overtaken.
+
+    ``epoch`` counts what begins anew; ``ends`` maps each epoch that this topic itself has ended
+    to its last stamp; ``last`` is the last stamp taken, None at the start of an epoch.
+    """
+
+    def __init__(self, small_jumps: bool = True) -> None:
         self.counts: Counter[Verdict] = Counter()
+        self.ends: dict[int, int] = {}
+        self._small_jumps = small_jumps
+        self.begin(0)
 
-    def check(self, stamp: int, values: np.ndarray) -> Verdict:
-        """Judge the next sample.
+    def begin(self, epoch: int) -> None:
+        """Start an epoch, whatever was before."""
+        self.epoch = epoch
+        self.last: int | None = None
+        self._interval = 0
+        self._latest: list[tuple[np.ndarray, np.ndarray]] = []   # at least one JUMP of samples
+        self._held: list[tuple[int, np.ndarray]] = []            # a jump that is not proven
 
-        Args:
-            stamp: int nanoseconds.
-            values: float64 array of any shape.
+    def join(self, epoch: int) -> None:
+        """Go on in an epoch that others have begun, at any stamp."""
+        self.counts[Verdict.BACKWARDS] += len(self._held)
+        self.begin(epoch)
 
-        Returns:
-            Verdict; ``self.epoch`` is that of this sample.
-        """
-        verdict = Verdict.OK
-        if not np.isfinite(values).all():
-            verdict = Verdict.NOT_FINITE
-        elif self.last is not None and stamp <= self.last:
-            if stamp == self.last:
-                verdict = Verdict.DUPLICATE
-            elif self.last - stamp <= JUMP_BACK:
-                verdict = Verdict.BACKWARDS
+    def take(self, stamp: np.ndarray, values: np.ndarray) -> Judged:
+        """Judge the next n samples: (n,) int64 ns, (n, k) float64."""
+        found = _Found(values[:0])
+        n = len(stamp)
+        fine = np.isfinite(values).all(axis=1) & (stamp >= 0)
+        step = np.diff(stamp)
+        breaks = np.flatnonzero(~(fine[1:] & (step > 0) & (step <= JUMP))) + 1
+        i = 0
+        while i < n:
+            if not self._held and fine[i] and self._follows(int(stamp[i]), JUMP):
+                following = int(np.searchsorted(breaks, i + 1))
+                end = int(breaks[following]) if following < len(breaks) else n
+                self._accept(found, stamp[i:end], values[i:end])
+                i = end
+                continue
+            if fine[i]:
+                self._judge(found, int(stamp[i]), values[i])
             else:
-                self.epoch += 1
-        if verdict is Verdict.OK:
-            self.last = stamp
-        self.counts[verdict] += 1
-        return verdict
+                self._refuse(found, int(stamp[i]), Verdict.NEGATIVE
+                             if np.isfinite(values[i]).all() else Verdict.NOT_FINITE)
+            i += 1
+        return found.judged()
+
+    def finish(self) -> Judged:
+        """The end of the topic: what is held back, judged without a sample after it."""
+        found = _Found(np.empty((0, len(self._held[0][1]) if self._held else 0)))
+        if self._held:
+            ahead = self._held[0][0] - (self.last or 0)
+            if 0 < ahead <= _UNPROVEN:
+                self._believe(found)
+            else:
+                self._drop(found)
+        return found.judged()
 
     def refused(self) -> dict[str, int]:
         """Counts of what was refused, in words."""
         return {verdict.value: count for verdict, count in self.counts.items()
                 if verdict is not Verdict.OK and count}
 
-    def check_block(self, stamp: np.ndarray,
-                    values: np.ndarray) -> tuple[list[Verdict] | None, np.ndarray]:
-        """Judge the next n samples, as :meth:`check` would one by one.
+    def _follows(self, stamp: int, limit: int) -> bool:
+        return self.last is None or 0 < stamp - self.last <= limit
 
-        Args:
-            stamp: (n,) int64 ns.
-            values: (n, k) float64.
+    def _judge(self, found: "_Found", stamp: int, row: np.ndarray) -> None:
+        """Judge one sample that is not simply the next one."""
+        limit = max(JUMP, _SLOW * self._interval)
+        follows = self._follows(stamp, limit)
+        if self._held and stamp == self._held[-1][0]:
+            self._refuse(found, stamp, Verdict.DUPLICATE)
+            return
+        if self._held:
+            side = self._side(stamp, follows, limit)
+            if side > 0:
+                self._held.append((stamp, row))
+                ahead = self.last is not None and self._held[0][0] > self.last
+                if ahead or side > 1 or len(self._held) >= _AGREEING:
+                    self._believe(found)
+                return
+            self._drop(found)
+        if follows:
+            self._accept(found, np.array([stamp]), row[None])
+        elif stamp == self.last or self._repeats(stamp, row):
+            self._refuse(found, stamp, Verdict.DUPLICATE)
+        elif self._is_overtaken(stamp):
+            self._refuse(found, stamp, Verdict.BACKWARDS)
+        else:
+            self._held.append((stamp, row))
 
-        Returns:
-            The verdicts, None if all are fit for use, and the epoch of each, (n,) int64.
-        """
-        n = len(stamp)
-        if n and (self.last is None or stamp[0] > self.last) and (
-                (np.diff(stamp) > 0).all() and np.isfinite(values).all()):
-            self.counts[Verdict.OK] += n
-            self.last = int(stamp[-1])
-            return None, np.full(n, self.epoch, dtype=np.int64)
-        verdicts, epochs = [], np.zeros(n, dtype=np.int64)
-        for i in range(n):
-            verdicts.append(self.check(int(stamp[i]), values[i]))
-            epochs[i] = self.epoch
-        return verdicts, epochs
+    def _side(self, stamp: int, follows: bool, limit: int) -> int:
+        """Whether a sample agrees with what is held back: 0 no, 1 yes, 2 yes and that proves it."""
+        assert self.last is not None
+        held = self._held[-1][0]
+        if stamp <= held or (held < self.last < stamp and stamp > held + limit):
+            return 0
+        if not follows:
+            return 1
+        if held > self.last:
+            return 0
+        # Set back by a few intervals, or overtaken: the interval that is more like the others.
+        usual = self._usual()
+        return 2 if abs(stamp - held - usual) <= abs(stamp - self.last - usual) else 0
+
+    def _believe(self, found: "_Found") -> None:
+        held, self._held = self._held, []
+        assert self.last is not None
+        if held[0][0] < self.last or held[0][0] > self.last + OTHER_CLOCK:
+            self.ends[self.epoch] = self.last
+            self.begin(self.epoch + 1)
+        self._accept(found, np.array([stamp for stamp, _ in held]),
+                     np.array([row for _, row in held]))
+
+    def _drop(self, found: "_Found") -> None:
+        held, self._held = self._held, []
+        assert self.last is not None
+        near = self.last - JUMP <= held[0][0] < self.last
+        for stamp, _ in held:
+            self._refuse(found, stamp, Verdict.BACKWARDS if near else Verdict.WILD)
+
+    def _accept(self, found: "_Found", stamp: np.ndarray, values: np.ndarray) -> None:
+        found.kept.append((stamp, values, self.epoch))
+        self.counts[Verdict.OK] += len(stamp)
+        if len(stamp) > 1:
+            self._interval = int(stamp[-1] - stamp[-2])
+        elif self.last is not None:
+            self._interval = int(stamp[-1]) - self.last
+        self.last = int(stamp[-1])
+        first = int(np.searchsorted(stamp, self.last - JUMP))
+        if first or len(self._latest) > _PARTS:
+            before = self._together() if not first else []
+            self._latest = [part for part in before if len(part[0])]
+        self._latest.append((stamp[first:].copy(), values[first:].copy()))
+
+    def _refuse(self, found: "_Found", stamp: int, verdict: Verdict) -> None:
+        self.counts[verdict] += 1
+        found.refused_stamps.append(stamp)
+        found.verdicts.append(verdict)
+
+    def _together(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The samples of the latest JUMP, as one part."""
+        assert self.last is not None
+        stamp = np.concatenate([s for s, _ in self._latest])
+        values = np.concatenate([v for _, v in self._latest])
+        first = int(np.searchsorted(stamp, self.last - JUMP))
+        self._latest = [(stamp[first:], values[first:])]
+        return self._latest
+
+    def _usual(self) -> float:
+        stamp = self._together()[0][0]
+        return float(np.median(np.diff(stamp))) if len(stamp) > 2 else float(self._interval)
+
+    def _repeats(self, stamp: int, row: np.ndarray) -> bool:
+        """Whether the very same sample has been taken lately."""
+        stamps, values = self._together()[0]
+        place = int(np.searchsorted(stamps, stamp))
+        return (place < len(stamps) and stamps[place] == stamp
+                and bool((values[place] == row).all()))
+
+    def _is_overtaken(self, stamp: int) -> bool:
+        """Whether an older sample is one that is missing, rather than of a clock set back."""
+        assert self.last is not None
+        if not self.last - JUMP <= stamp < self.last:
+            return False
+        if not self._small_jumps:
+            return True
+        stamps = self._together()[0][0]
+        place = int(np.searchsorted(stamps, stamp))
+        return place > 0 and bool(
+            stamps[place] > stamp and stamps[place] - stamps[place - 1] > _HOLE * self._usual())
 
 
-def fit_for_use(verdicts: list[Verdict] | None, count: int) -> np.ndarray:
-    """(count,) bool of the verdicts of :meth:`Guard.check_block`."""
-    if verdicts is None:
-        return np.ones(count, dtype=bool)
-    return np.array([verdict is Verdict.OK for verdict in verdicts], dtype=bool)
+class _Found:
+    """What a Guard finds in one block."""
+
+    def __init__(self, none: np.ndarray) -> None:
+        self._none = none
+        self.kept: list[tuple[np.ndarray, np.ndarray, int]] = []
+        self.refused_stamps: list[int] = []
+        self.verdicts: list[Verdict] = []
+
+    def judged(self) -> Judged:
+        if len(self.kept) == 1:
+            stamp, values, epoch = self.kept[0]
+            epochs = np.full(len(stamp), epoch, dtype=np.int64)
+        else:
+            stamp = np.concatenate([np.empty(0, np.int64), *(s for s, _, _ in self.kept)])
+            values = np.concatenate([self._none, *(v for _, v, _ in self.kept)])
+            epochs = np.concatenate([np.empty(0, np.int64), *(
+                np.full(len(s), epoch, np.int64) for s, _, epoch in self.kept)])
+        return Judged(stamp, values, epochs, self.refused_stamps, self.verdicts)
 
 
 def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
@@ -106,6 +267,10 @@ def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
         (log of what is fit for use, epochs (n,) int64 of its samples, Guard with the counts)
     """
     guard = Guard()
-    verdicts, epochs = guard.check_block(log.stamp, log.flat())
-    keep = fit_for_use(verdicts, len(log))
-    return (log, epochs, guard) if keep.all() else (log[keep], epochs[keep], guard)
+    places = np.arange(len(log))[:, None].astype(np.float64)
+    finite = np.isfinite(log.flat()).all(axis=1)
+    parts = [guard.take(log.stamp, np.where(finite[:, None], places, np.nan)), guard.finish()]
+    keep = np.concatenate([part.values[:, 0] for part in parts if len(part.stamp)]
+                          or [np.empty(0)]).astype(np.int64)
+    epochs = np.concatenate([part.epochs for part in parts])
+    return (log, epochs, guard) if len(keep) == len(log) else (log[keep], epochs, guard)

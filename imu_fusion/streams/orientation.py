@@ -227,7 +227,7 @@ class OrientationStream(Stream):
         output: OrientationOutputParams.
     """
 
-    same_frame = (IMU_TOPIC, MAG_TOPIC)
+    same_frame = one_clock = (IMU_TOPIC, MAG_TOPIC)
 
     def __init__(self, params: OrientationParams = OrientationParams(),
                  output: OrientationOutputParams = OrientationOutputParams(),

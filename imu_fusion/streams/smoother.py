@@ -6,7 +6,7 @@ end in :func:`smooth`, and so in the same messages.
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -132,7 +132,8 @@ class SmootherStream(Stream):
 
     One Imu sample takes 56 bytes, one of the magnetometer 32, one fix 112, one velocity
     104: 32 MB an hour for Imu and magnetometer at 100 Hz. When the clock is set back, what was
-    collected before is dropped.
+    collected before is dropped when live; in a replay and in batch the longest stretch is what is
+    smoothed, and how much that leaves out is said.
 
     Args:
         params: SmoothingParams.
@@ -140,16 +141,27 @@ class SmootherStream(Stream):
         warn: called with a text when something is wrong.
     """
 
+    one_clock = (IMU_TOPIC, MAG_TOPIC)
+
     def __init__(self, params: SmoothingParams = SmoothingParams(), limit: float = math.inf,
                  warn: Callable[[str], object] = lambda text: None) -> None:
         self.params = params
         self.limit = limit
         super().__init__(INPUTS, warn)
 
+    def reset(self, session_topics: Container[str] | None = None) -> None:
+        self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
+        self._longest = self._collected    # of the stretches before
+        self._samples = 0                  # of the Imu in them
+        super().reset(session_topics)
+
     def restart(self) -> None:
+        if self._merger.strict:
+            self._samples += _length(self._collected)[1]
+            self._longest = max(self._longest, self._collected, key=_length)
         self.dropped = 0
         self.bytes = 0
-        self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
+        self._collected = {topic: [] for topic in INPUTS}
 
     def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         for topic, (stamp, values) in samples.items():
@@ -185,16 +197,21 @@ class SmootherStream(Stream):
             raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
                                   f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
                                   "raise memory_limit")
-        for parts in self._collected.values():
+        chosen = max(self._longest, self._collected, key=_length)
+        if self._samples:
+            total = self._samples + _length(self._collected)[1]
+            self.warn(f"the clock was set: only the longest stretch, {_length(chosen)[1]} of "
+                      f"{total} Imu samples, is smoothed")
+        for parts in chosen.values():
             if len(parts) > 1:    # not again at the next call
                 parts[:] = [joined(parts)]
-        missing = [topic for topic in REQUIRED if not self._collected[topic]]
+        missing = [topic for topic in REQUIRED if not chosen[topic]]
         if missing:
             raise EstimationError(
                 f"nothing to smooth: no samples on {' and '.join(missing)}"
                 + (" since the clock was set back" if self.restarts else ""))
         return {topic: INPUTS[topic].log(*parts[0], self.frame_ids[topic])
-                for topic, parts in self._collected.items() if parts}
+                for topic, parts in chosen.items() if parts}
 
     def conclude(self) -> Conclusion:
         """What the samples of a whole recording make: the smoothed trajectory; its detail is
@@ -204,6 +221,12 @@ class SmootherStream(Stream):
         outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
         return Conclusion(messages(result.samples, outcome, self.params),
                           outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
+
+
+def _length(stretch):
+    """Whether a collection has what is needed, and its number of Imu samples."""
+    counts = [sum(len(stamp) for stamp, _ in stretch[topic]) for topic in REQUIRED]
+    return min(counts) > 0, counts[0]
 
 
 def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:

@@ -73,13 +73,15 @@ class Stream:
         inputs: dict of topic to SampleType, in order of rank at equal stamps.
         warn: called with a text when something is wrong with the input.
 
-    Subclasses name in ``same_frame`` the topics whose axes must be parallel, and implement
+    Subclasses name in ``same_frame`` the topics whose axes must be parallel, in ``one_clock`` those
+    whose sensors share a clock (None: all do, see BlockMerger), and implement
     ``restart`` (forget everything), ``use`` (samples of one epoch in, Messages out), ``flush``
     (Messages of what is held back), and where they have something to say ``look_at`` (texts about
     first samples) and ``conclude``.
     """
 
     same_frame: ClassVar[tuple[str, ...]] = ()
+    one_clock: ClassVar[tuple[str, ...] | None] = None
     #: To be set before the first sample where :meth:`conclude` is to be called: what that needs
     #: is then kept.
     concludes = False
@@ -90,7 +92,7 @@ class Stream:
         self.warn = warn
         self.undecodable: Counter[str] = Counter()
         self._merger = BlockMerger({topic: kind.width for topic, kind in inputs.items()},
-                                   self._refused)
+                                   self._refused, self.one_clock)
         self.reset()
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
@@ -173,7 +175,7 @@ class Stream:
         made: list[Messages] = []
         for segment in segments:
             if segment.restart:
-                self.warn("the clock was set back: the estimator starts anew")
+                self.warn("the clock was set back (or days ahead): the estimator starts anew")
                 made += self.flush()
                 self.restarts += 1
                 self.restart()

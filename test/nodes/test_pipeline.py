@@ -1,15 +1,24 @@
 """The pipeline: replay, smooth, record; as nodes on one executor and as processes."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 from rclpy.parameter import Parameter
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
 
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError, TopicError
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
+from imu_fusion.messages.typestore import TYPES
 from imu_fusion.nodes.pipeline import run_pipeline
+from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
@@ -108,6 +117,67 @@ def test_a_bad_surface_is_refused_before_anything_starts(tmp_path):
         with pytest.raises(LayoutError, match="nowhere"):
             call(bag, out, params)
         assert not out.exists()
+
+
+def as_ros1(path, messages):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    with Writer1(path) as writer:
+        connections = {}
+        for i, (topic, msgtype, log_time, cdr) in enumerate(messages):
+            message = TYPES.deserialize_cdr(bytes(cdr), msgtype)
+            message.header = noetic.types["std_msgs/msg/Header"](
+                seq=i, stamp=message.header.stamp, frame_id=message.header.frame_id)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=noetic)
+            writer.write(connections[topic], log_time, noetic.serialize_ros1(message, msgtype))
+    return path
+
+
+def as_ros2(path, messages, plugin):
+    with Writer2(path, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for topic, msgtype, log_time, cdr in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=TYPES)
+            writer.write(connections[topic], log_time, bytes(cdr))
+    return path
+
+
+def play(bag, out, logs):
+    """The recording of `imu_fusion play` through the orientation estimator."""
+    with NodeProcesses(logs) as nodes:
+        nodes.start("recorder", out=str(out))
+        nodes.start("orientation_estimator", qos="reliable")
+        subprocess.run(
+            [sys.executable, "-m", "imu_fusion.cli", "play", str(bag), "--rate", "0", "--wait-for",
+             "recorder", "--wait-for", "orientation_estimator"], check=True, timeout=120,
+            env=os.environ | {"ROS_DOMAIN_ID": str(nodes.domain)})
+        nodes.wait("recorder", 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["mcap", "db3", "ROS 1"])
+def test_each_format_gives_what_process_gives(tmp_path, form):
+    """Played, and through the pipeline; against what `process` makes of it as we write it."""
+    original = write(tmp_path / "original", 400)
+    with open_bag(original) as reader:
+        if form == "ROS 1":
+            bag = as_ros1(tmp_path / "foreign.bag", reader.messages())
+        else:
+            bag = as_ros2(tmp_path / "foreign", reader.messages(), {
+                "mcap": StoragePlugin.MCAP, "db3": StoragePlugin.SQLITE3}[form])
+    batch.process(original, tmp_path / "batch")
+    batch.process(bag, tmp_path / "again")
+    play(bag, tmp_path / "played", tmp_path / "logs")
+    run_pipeline(bag, tmp_path / "smoothed", show=False)
+    orientation = ["/imu/data", "/imu/rpy/filtered", "/imu/gyro_bias"]
+    smoothed = ["/smoother/odometry", "/smoother/imu", "/smoother/fix", "/smoother/path",
+                "/smoother/results"]
+    assert_same(tmp_path / "batch", tmp_path / "again", orientation + smoothed)
+    assert_same(tmp_path / "batch", tmp_path / "played", orientation)
+    assert_same(tmp_path / "batch", tmp_path / "smoothed", orientation + smoothed)
+    for out in ("played", "smoothed"):
+        assert_same(original, tmp_path / out, ["/imu/data_raw", "/fix", "/fix_velocity"])
 
 
 @pytest.mark.slow

@@ -74,3 +74,25 @@ def test_kernels_read_the_record_by_name():
     values = _read(record(Example.from_mapping({"sensor.gyro_range": [2.0]}), frame=np.arange(3.0)))
     assert values == (1e-3, 2.0, 3, True, 2.0)
     assert np.isnan(_read(record(Example(), frame=np.zeros(3)))[1])
+
+
+@dataclass(frozen=True)
+class Words(Parameters):
+    name: str = param("a", doc="What it is called.")
+
+
+@dataclass(frozen=True)
+class Named(Parameters):
+    words: Words = Words()
+    steps: int = param(3, doc="How many.")
+
+
+@njit
+def _steps(par):
+    return par[0].steps
+
+
+def test_a_group_of_words_is_no_part_of_the_record():
+    """numpy 1.26, which is Ubuntu 24.04's, dies of an empty record in it: the whole process."""
+    found = record(Named())
+    assert found.dtype.names == ("steps",) and _steps(found) == 3

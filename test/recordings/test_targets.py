@@ -12,6 +12,7 @@ from imu_fusion.cli import cli
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.mcap_writer import McapWriter
 from imu_fusion.recordings.targets import refuse_source, why_not_replaced
 from test.recordings.test_bag import IMU, START, imu, write
 
@@ -125,12 +126,17 @@ def test_what_a_live_recording_replaces_goes_when_it_is_complete(tmp_path):
         assert reader.count == 1
 
 
-def test_a_failed_convert_can_be_repeated(tmp_path):
+def test_a_failed_convert_can_be_repeated(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
     source = write(tmp_path / "source", 20)
     out = tmp_path / "out"
-    result = CliRunner().invoke(cli, ["convert", str(source), str(out), "--remap",
-                                      "no_slash:=/imu/mag"])
-    assert result.exit_code == 1 and not out.exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(McapWriter, "finish", full)
+        result = CliRunner().invoke(cli, ["convert", str(source), str(out)])
+    assert result.exit_code == 1 and "No space left" in result.output
+    assert list(tmp_path.iterdir()) == [source]
     assert CliRunner().invoke(cli, ["convert", str(source), str(out)]).exit_code == 0
 
 

@@ -1,12 +1,11 @@
 """Blocks: the same samples in the same order however they are cut, as by a plain sort."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_fusion.samples.blocks import BlockMerger
-from imu_fusion.samples.guard import JUMP_BACK, Guard, Verdict, fit_for_use
+from imu_fusion.samples.guard import JUMP, Guard, Verdict
 
 TOPICS = {"fix": 1, "mag": 1, "imu": 1}
 SECOND = 1_000_000_000
@@ -31,9 +30,9 @@ def expected(samples):
     rows, order = [], list(TOPICS)
     for topic, (stamp, values) in samples.items():
         guard = Guard()
-        for s, v in zip(stamp.tolist(), values):
-            if guard.check(s, v) is Verdict.OK:
-                rows.append((guard.epoch, s, order.index(topic), float(v[0])))
+        for judged in (guard.take(stamp, values), guard.finish()):
+            rows += [(int(e), int(s), order.index(topic), float(v[0]))
+                     for e, s, v in zip(judged.epochs, judged.stamp, judged.values)]
     return sorted(rows)
 
 
@@ -105,9 +104,10 @@ def test_live_everything_is_released_at_once_and_all_clocks_go_back_together():
     (segment,) = merger.add({"imu": (np.array([100 * SECOND]), one),
                              "mag": (np.array([90 * SECOND]), one)})
     assert set(segment.samples) == {"imu", "mag"} and merger.held == 0
-    (segment,) = merger.add({"imu": (np.array([3 * SECOND]), one)})
-    assert segment.restart
-    (segment,) = merger.add({"mag": (np.array([90 * SECOND - JUMP_BACK]), one)})
+    assert merger.add({"imu": (np.array([3, 4]) * SECOND, one[[0, 0]])}) == []
+    (segment,) = merger.add({"imu": (np.array([5 * SECOND]), one)})
+    assert segment.restart and len(segment.samples["imu"][0]) == 3
+    (segment,) = merger.add({"mag": (np.array([90 * SECOND - JUMP]), one)})
     assert not segment.restart, "the clock of the magnetometer has gone back already"
 
 
@@ -121,19 +121,49 @@ def test_what_is_refused_is_told_with_its_topic():
         Verdict.DUPLICATE.value: 1, Verdict.NOT_FINITE.value: 1}
 
 
-@pytest.mark.parametrize("sizes", [(1,) * 12, (5, 7), (12,)])
-def test_a_guard_judges_blocks_as_samples(sizes):
-    stamp = np.array([1, 2, 2, 1, 5, 6, 6 - 2 * JUMP_BACK, 4, 5, 6, 7, 8], dtype=np.int64)
-    values = np.zeros((12, 2))
-    values[4, 1] = np.inf
-    single, blocks = Guard(), Guard()
-    one_by_one = [(single.check(int(s), v) is Verdict.OK, single.epoch)
-                  for s, v in zip(stamp, values)]
-    start, found = 0, []
-    for size in sizes:
-        verdicts, epochs = blocks.check_block(stamp[start:start + size],
-                                              values[start:start + size])
-        keep = fit_for_use(verdicts, size)
-        found += list(zip(keep.tolist(), epochs.tolist()))
-        start += size
-    assert found == one_by_one and blocks.counts == single.counts
+def one_by_one(stamps):
+    stamps = np.array(stamps, dtype=np.int64)
+    return stamps, np.arange(float(len(stamps)))[:, None]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(20, 3000), st.integers(0, 900), st.integers(0, 100))
+def test_a_slow_topic_follows_a_clock_that_was_set_back(back, start, seed):
+    """The fix, once a second, does not see an Imu's clock that is set back in the tenth second by
+    ``back`` ms; what comes more than a second later than the Imu's last sample before is of the
+    new epoch, however the samples were cut into blocks."""
+    true = np.arange(0, 20_000, 10) * 1_000_000 + 100 * SECOND
+    imu = true - (true >= 110 * SECOND) * back * 1_000_000
+    fix = np.arange(20) * SECOND + 100 * SECOND + start * 1_000_000
+    fix = fix - (fix >= 110 * SECOND) * back * 1_000_000
+    samples = {"fix": one_by_one(fix), "imu": one_by_one(imu)}
+
+    def run(blocks):
+        merger = BlockMerger(TOPICS, one_clock=("imu", "mag"))
+        merger.begin(["fix", "imu"])
+        found, epoch = [], 0
+        for block in blocks:
+            rows, epoch = rows_of(merger.add(block), epoch)
+            found += rows
+        return found + rows_of(merger.end(TOPICS), epoch)[0]
+
+    rng = np.random.default_rng(seed)
+
+    def blocks():
+        at = dict.fromkeys(samples, 0)
+        while any(at[t] < len(s[0]) for t, s in samples.items()):
+            block = {}
+            for topic, (stamp, values) in samples.items():
+                size = int(rng.integers(0, 7 if topic == "fix" else 700))
+                i, at[topic] = at[topic], at[topic] + size
+                block[topic] = stamp[i:at[topic]], values[i:at[topic]]
+            yield block
+
+    whole = run([samples])
+    assert run(blocks()) == whole
+    epochs = {topic: [row[0] for row in whole if row[2] == k] for k, topic in
+              ((0, "fix"), (2, "imu"))}
+    assert epochs["imu"] == [0] * 1000 + [1] * 1000
+    assert len(epochs["fix"]) >= 18    # one may look repeated, one overtaken
+    late = [stamp > 111 * SECOND for stamp in fix.tolist()]
+    assert sum(epochs["fix"]) >= sum(late) - 2

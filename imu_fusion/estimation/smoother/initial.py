@@ -78,7 +78,8 @@ def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarr
     if initial_quat is None:
         reading = None
         if mag is not None and np.any(kind == MAG):
-            early = mag.between(log.stamp[0], log.stamp[beginning] + 1)
+            last = log.stamp[min(beginning, len(log) - 1)]    # of a log as short as that, too
+            early = mag.between(log.stamp[0], last + 1)
             finite = np.isfinite(early.mag).all(axis=1)
             reading = early.mag[finite].mean(axis=0) if finite.any() else None
         initial_quat = attitude_from_vectors(log.acc[:beginning].mean(axis=0), reading,

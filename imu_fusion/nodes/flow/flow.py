@@ -1,7 +1,9 @@
 """A node's part in sessions, as taker, sender or both: :class:`Flow`."""
 
+import time
 from collections.abc import Callable, Collection
 
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -12,6 +14,7 @@ from imu_fusion.nodes.flow.source import Output, Source
 from imu_fusion.nodes.flow.state import END, State
 
 _LOOK_EVERY = 0.1  # s
+_SERVE_EVERY = 0.02  # s
 _POLL, _POLL_AT_MOST = 0.002, 0.016  # s, between looks whether all is acknowledged
 
 
@@ -46,7 +49,7 @@ class Flow:
         self.sink = Sink(self.peers, hold, on_begin)
         if relays:
             self.source.upstream, self.sink.feeds = self.sink.company, self.source
-        self._poll = _POLL
+        self._poll, self._serve_at = _POLL, 0.0
         self.peers.say()
         steady_timer(node, _LOOK_EVERY, self._look)
 
@@ -90,6 +93,21 @@ class Flow:
             return idle
         self._poll = min(2.0 * self._poll, _POLL_AT_MOST)
         return min(idle, self._poll)
+
+    def wait(self, executor: Executor, seconds: float) -> None:
+        """Wait for something to do, at most so long, and let callbacks run.
+
+        A turn of an executor looks at all that a node has, which takes longer than our work on
+        a sample. So while messages come these alone are waited for, and the others have a turn
+        now and then.
+        """
+        if time.monotonic() > self._serve_at:
+            self._serve_at = time.monotonic() + _SERVE_EVERY
+            self.sink.gate.aside = True
+            executor.spin_once(timeout_sec=0.0)
+            self.sink.gate.aside = False
+        if not self.sink.wait(min(seconds, _SERVE_EVERY)):
+            executor.spin_once(timeout_sec=seconds)
 
     def close(self) -> None:
         """The node stops: whoever listens is told that nothing more comes, and time to hear it."""

@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
@@ -68,14 +70,15 @@ class Turn:
 
 
 class _Gate(ReentrantCallbackGroup):
-    """Subscriptions of an executor's wait set, while ``is_open()``."""
+    """Subscriptions of an executor's wait set, while ``is_open()`` and not ``aside``."""
 
     def __init__(self, is_open):
         super().__init__()
         self._is_open = is_open
+        self.aside = False
 
     def can_execute(self, entity):
-        return self._is_open()
+        return not self.aside and self._is_open()
 
 
 class Input:
@@ -224,6 +227,22 @@ class Sink:
             self._report_at, self._unreported = time.monotonic(), 0.0
             self._reported = {topic: i.count for topic, i in self.inputs.items() if i.sessions}
             self.peers.say()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for messages alone, at most so long; whether there are any."""
+        handles = [i.subscription.handle for i in self.inputs.values()]
+        if not handles or not self.gate.can_execute(None):
+            return False
+        with ExitStack() as held:
+            for handle in (*handles, self.node.context.handle):
+                held.enter_context(handle)
+            waiting = _rclpy.WaitSet(len(handles), 0, 0, 0, 0, 0, self.node.context.handle)
+            waiting.clear_entities()
+            for handle in handles:
+                waiting.add_subscription(handle)
+            waiting.wait(round(seconds * 1e9))
+            self.woken = bool(waiting.get_ready_entities("subscription"))
+        return self.woken
 
     def take(self) -> Turn:
         """One turn: all that waits on all topics."""

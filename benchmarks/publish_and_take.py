@@ -1,0 +1,72 @@
+"""What passing bytes through three processes costs without any work: the bound of the nodes.
+
+    python -m benchmarks.publish_and_take ROLE COUNT
+
+``first`` publishes ``COUNT`` messages on each of two topics, ``middle`` takes both and publishes
+one for each of the first topic, ``last`` takes all three. Windows and QoS are those of the nodes.
+"""
+
+import sys
+import time
+
+import rclpy
+from rclpy.duration import Duration
+from sensor_msgs.msg import Imu, MagneticField
+
+from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.nodes.base import use_fast_heartbeats
+from imu_fusion.nodes.flow.qos import reliable_qos, session_qos
+from imu_fusion.nodes.flow.source import WINDOW
+
+TOPICS = {"/imu/data_raw": Imu, "/imu/mag": MagneticField, "/imu/data": Imu}
+NAP = 0.002  # s
+MADE = {Imu: imu_message(0, "imu_link", (0, 0, 0), (0, 0, 9.8)),
+        MagneticField: mag_message(0, "imu_link", (0, 0, 0))}
+
+
+def publish(outs, count):
+    """So many on each, as fast as they are acknowledged."""
+    for i in range(count):
+        for publisher in outs:
+            publisher.publish(MADE[publisher.msg_type])
+        if i % (WINDOW // 2) == WINDOW // 2 - 1:
+            while not all(p.wait_for_all_acked(Duration(nanoseconds=0)) for p in outs):
+                time.sleep(NAP)
+
+
+def main(role, count):
+    """One of the three processes."""
+    use_fast_heartbeats()
+    rclpy.init()
+    node = rclpy.create_node(role)
+    topics = list(TOPICS)
+    outs = [node.create_publisher(TOPICS[t], t, reliable_qos())
+            for t in {"first": topics[:2], "middle": topics[2:], "last": []}[role]]
+    ins = [node.create_subscription(TOPICS[t], t, lambda cdr: None, session_qos(), raw=True)
+           for t in {"first": [], "middle": topics[:2], "last": topics}[role]]
+    readers = {"/imu/data_raw": 2, "/imu/mag": 2, "/imu/data": 1}
+    while any(p.get_subscription_count() < readers[p.topic] for p in outs):
+        time.sleep(NAP)
+    if role == "first":
+        # The last one sees the middle one a little later than we do.
+        time.sleep(2.0)
+        publish(outs, count)
+    left = {id(s): count for s in ins}
+    while any(left.values()):
+        taken = 0
+        for s in ins:
+            with s.handle:
+                while s.handle.take_message(s.msg_type, True) is not None:
+                    taken += 1
+                    left[id(s)] -= 1
+                    if outs and s is ins[0]:
+                        outs[0].publish(MADE[Imu])
+        if not taken:
+            time.sleep(NAP)
+    for p in outs:
+        p.wait_for_all_acked(Duration(seconds=60))
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))
