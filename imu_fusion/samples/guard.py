@@ -220,11 +220,12 @@ class Guard:
         return float(np.median(np.diff(stamp))) if len(stamp) > 2 else float(self._interval)
 
     def _repeats(self, stamp: int, row: np.ndarray) -> bool:
-        """Whether the very same sample has been taken lately."""
+        """Whether the very same sample has been taken lately. Of a signal that stands still, equal
+        values are no sign of it."""
         stamps, values = self._together()[0]
         place = int(np.searchsorted(stamps, stamp))
         return (place < len(stamps) and stamps[place] == stamp
-                and bool((values[place] == row).all()))
+                and bool((values[place] == row).all() and (values != row).any()))
 
     def _is_overtaken(self, stamp: int) -> bool:
         """Whether an older sample is one that is missing, rather than of a clock set back."""

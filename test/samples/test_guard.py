@@ -93,6 +93,12 @@ def test_a_clock_set_back_begins_an_epoch_without_a_sample_lost(by, jitter):
     assert [stamp for _, stamp in kept] == pytest.approx(stamps, abs=1e-5)
 
 
+def test_a_clock_set_back_is_seen_of_a_signal_that_stands_still():
+    """On a regular grid the very same samples come again, as if they had been sent twice."""
+    kept, refused = judge([*REGULAR, *(t + 500.0 - 160.0 for t in REGULAR)], np.ones((100, 2)))
+    assert not refused and [epoch for epoch, _ in kept] == [0] * 50 + [1] * 50
+
+
 def test_a_sensor_without_a_say_in_the_clock_refuses_what_is_less_than_a_jump_back():
     kept, refused = judge([*REGULAR, *(t + 500.0 - 160.0 for t in REGULAR)], small_jumps=False)
     assert refused == {Verdict.BACKWARDS: 15, Verdict.DUPLICATE: 1}
