@@ -10,7 +10,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 # shapes in parentheses, indented examples.
 PEP257 := --add-ignore D205 D208 D402 D209 D213 D400 D401 D403 D406 D407 D413 D415 D417
 
-.PHONY: demo test test-slow test-all lint bench docs clean kernels
+.PHONY: demo test test-slow test-all coverage lint bench docs clean kernels
 
 $(READY): setup.py setup.cfg package.xml
 	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), "imu_fusion needs Python 3.11 to 3.13 (the Jazzy wheels), this is " + sys.version.split()[0] + "; try make PYTHON=python3.12"'
@@ -33,6 +33,12 @@ test-slow: kernels
 
 test-all: kernels
 	$(PYTEST)
+
+# Compiled code cannot be traced: the kernels run in plain Python here, on what is quick enough.
+coverage: kernels
+	$(PYTEST) -m "not slow" --cov=imu_fusion.estimation --cov-report= test/estimation
+	NUMBA_DISABLE_JIT=1 $(PYTEST) --cov=imu_fusion.estimation --cov-append \
+	    --cov-report=term test/estimation/test_properties.py
 
 # The ament linters are Debian packages: python3-ament-flake8, -pep257, -xmllint.
 # ament_copyright is not run: the licence is in LICENSE and package.xml, once.

@@ -20,7 +20,7 @@ peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
 docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
 test = ["ruff~=0.17.6", "mypy~=2.4.1", "types-PyYAML",
-        "pytest>=7.4", "pytest-xdist>=3.5",
+        "pytest>=7.4", "pytest-xdist>=3.5", "pytest-cov>=5",
         "hypothesis>=6", "colcon-common-extensions", *report, *terrain, *docs]
 
 # Read, not imported: nothing of the package is installed yet.

@@ -179,17 +179,21 @@ def mag_values(values: np.ndarray) -> np.ndarray:
 def fix_values(values: np.ndarray) -> np.ndarray:
     """Latitude, longitude, height, covariance row by row, status (..., 13) of NavSatFix values.
 
-    A covariance whose type is unknown becomes zeros, whatever the message has in it."""
-    known = values[..., -1:] != 0
-    cov = np.where(known, values[..., FIX["position_covariance"]], 0.0)
+    A covariance whose type is unknown, or that is not finite, becomes zeros: unknown."""
+    cov = _known(values[..., FIX["position_covariance"]] * (values[..., -1:] != 0))
     return np.concatenate([values[..., 2:5], cov, values[..., :1]], axis=-1)
 
 
 def velocity_values(values: np.ndarray) -> np.ndarray:
     """Velocity, covariance row by row (..., 12) of TwistWithCovarianceStamped values."""
     cov = values[..., TWIST["covariance"]].reshape(*values.shape[:-1], 6, 6)[..., :3, :3]
-    return np.concatenate([values[..., TWIST["linear"]], cov.reshape(*values.shape[:-1], 9)],
-                          axis=-1)
+    return np.concatenate([values[..., TWIST["linear"]],
+                           _known(cov.reshape(*values.shape[:-1], 9))], axis=-1)
+
+
+def _known(cov):
+    """Covariances (..., 9), zeros where they are not finite."""
+    return np.where(np.isfinite(cov).all(axis=-1, keepdims=True), cov, 0.0)
 
 
 def pose_values(values: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.estimation.smoother.measurements.gnss_fix import valid_fixes
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.result import SmootherResult
@@ -46,7 +45,7 @@ class Smoothed:
 
     def fixes_world(self) -> tuple[FixLog, np.ndarray]:
         """Valid fixes: FixLog and positions (m, 3) m."""
-        fix = self.fix[valid_fixes(self.fix)]
+        fix = self.fix[self.fix.usable]
         return fix, self.result.frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
 
     def delay(self, *states: str) -> float:

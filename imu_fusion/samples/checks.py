@@ -314,20 +314,20 @@ def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
     """All findings about a FixLog."""
     position = np.column_stack([log.latitude_deg, log.longitude_deg, log.height])
     result = [*check_stamps(log.stamp, name)]
-    without = int(np.sum(log.status < 0))
+    without = int(np.sum(log.status == -1))
     if without:
         result.append(Finding("fix", f"{name}: {without} of {len(log)} messages have no fix "
                                      "(status -1); they are left out"))
-    valid = log[log.status >= 0]
-    result += check_finite(position[log.status >= 0], name, "position")
+    valid = log[log.status != -1]
+    result += check_finite(position[log.status != -1], name, "position")
     outside = int(np.sum((np.abs(valid.latitude_deg) > 90) | (np.abs(valid.longitude_deg) > 180)))
     if outside:
         result.append(Finding("fix", f"{name}: {outside} positions lie outside of +-90 deg "
-                                     "latitude, +-180 deg longitude"))
+                                     "latitude, +-180 deg longitude; they are left out"))
     null = int(np.sum((valid.latitude_deg == 0) & (valid.longitude_deg == 0)))
     if null:
         result.append(Finding("fix", f"{name}: {null} positions are 0 deg, 0 deg: a receiver "
-                                     "without a fix that says it has one"))
+                                     "without a fix that says it has one; they are left out"))
     return result
 
 

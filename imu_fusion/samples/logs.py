@@ -102,7 +102,7 @@ class AccelerometerLog(Log):
 class FixLog(Log):
     """GNSS positions on WGS84: ``latitude_deg``, ``longitude_deg`` (n,), ellipsoidal
     ``height`` (n,) m, ``cov_enu`` (n, 3, 3) m^2 (zeros: unknown), ``status`` (n,) as in
-    sensor_msgs/NavSatStatus (-1: no fix)."""
+    sensor_msgs/NavSatStatus (-1: no fix; -2: not set by the driver)."""
 
     latitude_deg: np.ndarray = _column(())
     longitude_deg: np.ndarray = _column(())
@@ -110,6 +110,15 @@ class FixLog(Log):
     cov_enu: np.ndarray = _column((3, 3))
     status: np.ndarray = _column(())
     frame_id: str = "gnss"
+
+    @property
+    def usable(self) -> np.ndarray:
+        """Mask (n,) of the fixes that say where they are: on Earth, finite, not those at 0 deg,
+        0 deg that a receiver gives before it knows, and not said to be none."""
+        known = (np.isfinite(self.height) & (np.abs(self.latitude_deg) <= 90.0)
+                 & (np.abs(self.longitude_deg) <= 180.0))
+        null = (self.latitude_deg == 0.0) & (self.longitude_deg == 0.0)
+        return known & ~null & (self.status != -1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -263,7 +263,7 @@ class Outcome:
         numbers: dict[str, Any] = {
             "samples": len(result.samples), "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
-            "misfit": result.misfit()}
+            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import EstimationError, SampleError
-from imu_fusion.estimation.smoother.measurements.gnss_fix import valid_fixes
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
@@ -18,12 +17,12 @@ _FULL_SCALE = 0.999   # of a range from which on a reading counts as clipped: lo
 
 
 def reference_frame(surface: Surface | None, fix: FixLog) -> LocalFrame:
-    """The surface's frame, or one at the first valid fix.
+    """The surface's frame, or one at the first usable fix.
 
     Raises:
         EstimationError: the surface is elsewhere.
     """
-    i = np.flatnonzero(valid_fixes(fix))[0]
+    i = np.flatnonzero(fix.usable)[0]
     first = float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
     if surface is None:
         return LocalFrame(*first)

@@ -100,7 +100,8 @@ def detect_jump(imu: ImuLog, velocity: VelocityLog | None) -> JumpEvents:
     second = int(np.argmax(candidates))
     if not np.isfinite(candidates[second]):
         raise EstimationError("no take-off and touch-down: only one peak of the specific force "
-                              "at speed (jump.takeoff and jump.touchdown give them)")
+                              "at speed (jump.takeoff and jump.touchdown give them; see that the "
+                              "velocities are of the clock of the Imu)")
     early, late = sorted((int(imu.stamp[first]), int(imu.stamp[second])))
     return JumpEvents(early, late - int(LEAD * 1e9))
 

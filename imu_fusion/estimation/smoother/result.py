@@ -26,9 +26,14 @@ _SINGLE_PASS = 1.3
 _EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
 # Simulated jumps, sunk by 0.3 m: up to 1.4; by 0.7 m, or a fall of 0.4 m: from 2.5.
 _FIRST_EXCESS = 2.0
+_LEAP_SECONDS = 18.0         # s, GPS time ahead of UTC since 2017
 _SILENT = 0.01               # share of the samples
 _BESIDE = 5.0                # standard deviations of the median innovation of fixes
 _MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
+_WANDERS = {
+    "fix": "of the receiver: gnss.position_error_sd; a change of datum or antenna",
+    "velocity": "of the receiver: gnss.velocity_error_sd",
+    "mag": "of the field: iron nearby, sensor.mag_bias_sd"}
 _ADVICE = {m.name: m.advice for m in MEASUREMENTS}
 
 
@@ -57,6 +62,10 @@ class SmootherResult:
     ``surface``: name of a constraint -> SurfaceFit.
     ``cost``: of the trajectory before each step; ``iterations`` counts the steps;
     ``converged``: None where the method passes once and so cannot tell.
+    ``gnss_lag``: s, by which the receiver's stamps were found late and taken earlier.
+    ``wander``: name -> how much larger than white noise leaves them its innovations are in the
+    mean over seconds (:func:`.whiteness.wandering`), 1 where they are white; what is stated has
+    been widened by it (:func:`.whiteness.widen`).
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
@@ -70,6 +79,8 @@ class SmootherResult:
     events: JumpEvents | None = None
     jump: JumpResult | None = None
     surface: dict[str, SurfaceFit] = field(default_factory=dict)
+    gnss_lag: float = 0.0
+    wander: dict[str, float] = field(default_factory=dict)
     failure: str = ""
 
     def summary(self) -> str:
@@ -115,6 +126,14 @@ class SmootherResult:
         if self.converged is False:
             texts.append(f"the smoother did not converge in {self.iterations} iterations: take its "
                          "result as provisional")
+        if self.gnss_lag:
+            leap = ": GPS time that was not turned into UTC" if abs(
+                abs(self.gnss_lag) - _LEAP_SECONDS) < 0.5 else ""
+            texts.append(f"the stamps of fixes and velocities are {abs(self.gnss_lag):.1f} s "
+                         f"{'late' if self.gnss_lag > 0 else 'early'} against those of the Imu, "
+                         f"as turns and forces tell{leap}; they were taken so much "
+                         f"{'earlier' if self.gnss_lag > 0 else 'later'}. Correct the recording, "
+                         "or see that both clocks are one")
         astray = self._astray()
         if astray is not None:
             texts.append(f"the {astray[0]} innovations of the single pass have an RMS of "
@@ -125,6 +144,15 @@ class SmootherResult:
             if size > _MISFIT:
                 texts.append(f"the {name} innovations are {size:.1f} times as large as their "
                              f"standard deviations: {_ADVICE[name]}")
+        for name, excess in self.wander.items():
+            if excess > 1.0:
+                texts.append(
+                    f"the {name} innovations wander: their means over seconds are {excess:.1f} "
+                    "times as large as white noise leaves them: a step or slow errors "
+                    f"({_WANDERS.get(name, 'sensor noise')}), or noise and bias walks of the Imu "
+                    "that are too small (sensor.gyro_noise_density, sensor.acc_noise_density, "
+                    "sensor.gyro_bias_walk, sensor.acc_bias_walk); the standard deviations of "
+                    f"{'headings' if name == 'mag' else 'all'} are as much larger")
         beside = self._beside()
         if beside is not None:
             texts.append("the fixes lie beside the trajectory that the surface holds, by "

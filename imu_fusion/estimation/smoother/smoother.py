@@ -1,9 +1,12 @@
 """The smoother: trajectory, attitude and sensor errors from a whole recording."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
+from imu_fusion.estimation.smoother.gnss_lag import find_lag
 from imu_fusion.estimation.smoother.imu_input import prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.initial import first_attitudes
 from imu_fusion.estimation.smoother.iterated import Solution, solve
@@ -23,6 +26,7 @@ from imu_fusion.estimation.smoother.surface_fit import (
 )
 from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import likeliest
+from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.surfaces.constraint import Surface
@@ -31,6 +35,8 @@ from imu_fusion.surfaces.hill import Hill
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
+
+_LAG_SD = 0.2        # s, of a lag of the receiver's stamps that was found on a grid
 
 
 class Smoother:
@@ -62,10 +68,36 @@ class Smoother:
             EstimationError: no fix; events needed and not found; no convergence to finite
                 values.
         """
+        if self.params.method == "extended_rts":
+            return ExtendedRts(self.params, self.surface).run(imu, mag, fix, velocity, events,
+                                                              initial_quat)
+        try:
+            told = result = self._smooth(imu, mag, fix, velocity, events, initial_quat)
+        except EstimationError:
+            if self.surface is None or events is not None:
+                raise
+            # With fixes of another time no jump is found, and surfaces contradict.
+            result = None
+            told = Smoother(self.params)._smooth(imu, mag, fix, velocity, None, initial_quat)
+            if not find_lag(told.samples, velocity):
+                raise
+        lag = find_lag(told.samples, velocity)
+        if lag:
+            result = self._earlier(lag)._smooth(imu, mag, _earlier(fix, lag),
+                                                _earlier(velocity, lag), events, initial_quat)
+            delay, sd = result.states["gnss_time_offset"]
+            result = replace(result, gnss_lag=lag, states={
+                **result.states, "gnss_time_offset": (delay + lag, sd)})
+        return result
+
+    def _earlier(self, lag):
+        """A smoother whose state of the delay can tell what is left of a lag."""
+        sd = max(self.params.gnss.time_offset_sd, _LAG_SD)
+        return Smoother(self.params.replace(**{"gnss.time_offset_sd": sd}), self.surface)
+
+    def _smooth(self, imu, mag, fix, velocity, events, initial_quat):
+        """As :meth:`run`, with the stamps as they are."""
         params, surface = self.params, self.surface
-        if params.method == "extended_rts":
-            return ExtendedRts(params, surface).run(imu, mag, fix, velocity, events,
-                                                    initial_quat)
         prepared = prepare_imu(imu, params)
         fix = required(fix)
         frame = reference_frame(surface, fix)
@@ -100,6 +132,11 @@ class Smoother:
         return best
 
 
+def _earlier(log, lag):
+    """A log whose stamps are earlier by a lag (s)."""
+    return replace(log, stamp=log.stamp - np.int64(round(lag * 1e9)))
+
+
 def _smooth(problem: Problem, frame: LocalFrame, hill: Hill | None, quat: np.ndarray,
             events: JumpEvents | None) -> SmootherResult | None:
     """From one first attitude; None where it diverges."""
@@ -130,6 +167,8 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             width = len(measurement.components)
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],
                                              problem.innovation[of_kind][:, :width])
+    wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
+    widen(samples, wander)
     fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
     jump, failure = None, ""
     if hill is not None and solution.events is not None:
@@ -140,4 +179,4 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             failure = str(error)
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
-                          failure)
+                          wander=wander, failure=failure)

@@ -41,7 +41,9 @@ def test_a_start_at_speed_finds_its_heading(drive, start, delays):
     logs = [log.between(begin, begin + 60_000_000_000) for log in (imu, fix, velocity)]
     changes = {"gnss.time_offset_sd": 0.2, "gnss.velocity_time_offset_sd": 0.2} if delays else {}
     result = Smoother(SmootherParams.from_mapping(changes)).run(logs[0], None, *logs[1:])
-    assert result.converged and result.misfit()["fix"] < 1.5 and not result.remarks()
+    assert result.converged and result.misfit()["fix"] < 1.5
+    # The noise is not this car's, and with a late velocity it shows: that is said.
+    assert all("innovations wander" in remark for remark in result.remarks())
     if delays:
         assert result.states["velocity_time_offset"][0][0, 0] == pytest.approx(0.125, abs=0.01)
 

@@ -11,6 +11,7 @@ from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, detect_jump, find_jump
 from imu_fusion.estimation.smoother.measurements.gnss import even_stamps, spaced
 from imu_fusion.estimation.smoother.params import Gnss, Iteration, Jump, Sensor
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, period_means, record
@@ -145,8 +146,8 @@ def test_wandering_position_error_needs_its_state(jump):
 
 
 def test_filtered_velocities_need_their_state(jump):
-    """A receiver's filter makes its velocity errors wander: as white ones they are believed too
-    much."""
+    """A receiver's filter makes its velocity errors wander: as white ones they would be believed
+    too much (NEES 36), were it not noticed; with their state there is nothing to notice."""
     sd = tuple(np.sqrt(0.95) * np.array(Gnss().velocity_sd))
     models = (SmootherParams(),
               SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)))
@@ -156,12 +157,12 @@ def test_filtered_velocities_need_their_state(jump):
         truth = filtered.motion.vel_world
         for params in models:
             r = Smoother(params).run(filtered.imu, filtered.mag, filtered.fix, filtered.velocity)
-            error = r.samples["vel_world"] - truth
-            found.append(np.einsum("ni,ni->n", error, np.linalg.solve(
-                r.samples["cov_velocity"], error[..., None])[..., 0]).mean())
-    white, states = np.mean(np.reshape(found, (4, 2)), axis=0)
-    # Ideal 3; ten seeds of the benchmark give 36 and 3.2.
-    assert white > 10.0 and 1.0 < states < 6.0
+            found.append((nees(r.samples["vel_world"] - truth, r.samples["cov_velocity"]).mean(),
+                          r.wander["velocity"]))
+    (white, states), (noticed, none) = np.mean(np.reshape(found, (4, 2, 2)), axis=0).T
+    # Ideal 3; ten seeds of the benchmark give 3.2 with states.
+    assert 1.0 < states < 6.0 and none == 1.0
+    assert 1.0 < white < 6.0 and noticed > 2.0 and white * noticed ** 2 > 15.0
 
 
 def test_jittered_stamps_of_even_fixes_are_put_back():

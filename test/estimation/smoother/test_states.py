@@ -125,7 +125,8 @@ def test_the_point_at_the_lever_arm_is_held(jump):
     # Without it, or on the other side, the trajectory is held where the sensor is not.
     for sign, height in ((0, 0.4), (-1, 0.8)):
         result, rms, ratio = judged(sign * LEVER)
-        assert rms[2] > height and ratio > 1000.0
+        # Of the latter the fixes say it too, and what is stated is widened.
+        assert rms[2] > height and ratio * max(result.wander.values()) ** 2 > 1000.0
         assert any("stands off the surface" in text for text in result.remarks())
 
 

@@ -1,7 +1,5 @@
 """A fix: where the antenna was. p + R l + wandering error, at its stamp less the delay."""
 
-import numpy as np
-
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.measurements.gnss import chosen, put_gyr_scale, roots, vector
 from imu_fusion.estimation.smoother.measurements.measurement import (
@@ -17,31 +15,25 @@ from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import FixLog
 
 
-def valid_fixes(fix: FixLog) -> np.ndarray:
-    """Mask (m,) of the fixes that say where they are."""
-    return ((fix.status >= 0) & np.isfinite(fix.latitude_deg) & np.isfinite(fix.longitude_deg)
-            & np.isfinite(fix.height))
-
-
 def required(fix: FixLog | None) -> FixLog:
-    """The log, if it holds a valid fix.
+    """The usable fixes of a log.
 
     Raises:
-        EstimationError: none is valid.
+        EstimationError: there are none.
     """
-    if fix is None or not valid_fixes(fix).any():
+    if fix is None or not fix.usable.any():
         raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation alone "
                               "is the job of the orientation estimator")
-    return fix
+    return fix[fix.usable]
 
 
 def prepare(fix: FixLog, frame: LocalFrame, params: SmootherParams) -> Readings:
-    """Valid fixes, as positions in the world.
+    """Usable fixes, as positions in the world.
 
     Raises:
         SampleError: see :func:`.gnss.roots` and :func:`.gnss.even_stamps`.
     """
-    fix, stamp = chosen(fix[valid_fixes(fix)], params)
+    fix, stamp = chosen(fix[fix.usable], params)
     return Readings(stamp, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height),
                     roots(fix.cov_enu, params.gnss.fix_sd, params, "the fixes"),
                     squared_scale(params.gnss))

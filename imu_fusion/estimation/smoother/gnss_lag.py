@@ -1,0 +1,92 @@
+"""Stamps of the receiver that lie whole seconds beside those of the Imu.
+
+GPS time taken for UTC is 18 s ahead, a logger that stamps on arrival is late by a second. A state
+of the delay finds what is within its prior; this finds the rest: turns and changes of velocity as
+the receiver tells them are compared with those that the Imu felt at shifted times.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.samples.logs import VelocityLog
+
+_LARGEST = 30.0       # s, on either side
+_GRID = 0.1           # s
+_SPAN = 10            # steps of the grid, over which changes are compared
+_FEWEST = 20          # changes
+_GAP = 3.0            # periods of the receiver, or spans, after which it says nothing between
+_MOVING = 1.0         # m/s, from which on a velocity has a course
+_CORRELATION = 0.8    # at the best shift, at least
+_BETTER = 0.5         # of the unexplained squares at no shift, that the best may leave at most
+_APART = 0.5          # s: what is nearer is for the state of the delay (receivers: 0.1 to 0.3)
+
+
+def find_lag(samples: np.ndarray, velocity: VelocityLog | None) -> float:
+    """Seconds by which the stamps of velocities are late, 0 where no other shift fits far better.
+
+    Args:
+        samples: of a SmootherResult: attitudes, rates and forces at the stamps of the Imu. A wrong
+            lag tilts the attitudes until the forces fit; turns about the vertical hardly feel it.
+        velocity: VelocityLog or None, from which no lag is told.
+    """
+    if velocity is None or len(velocity) < 3:
+        return 0.0
+    t = (samples["stamp"] - samples["stamp"][0]) * 1e-9
+    at = (velocity.stamp - samples["stamp"][0]) * 1e-9
+    turn = Rotation.from_quat(samples["quat_world_imu"])
+    vel = velocity.vel_world
+    course = np.unwrap(np.arctan2(vel[:, 1], vel[:, 0]))
+    grid = np.arange(min(t[0], at[0]), max(t[-1], at[-1]) + _GRID, _GRID)
+    # Of the forces gravity is a mean, which is put aside.
+    felt = _felt(grid, t, np.column_stack([turn.apply(samples["gyr"])[:, 2],
+                                           turn.apply(samples["acc"])]))
+    told = _told(grid, at, np.column_stack([course, vel]))
+    moving = np.interp(grid, at, np.linalg.norm(vel[:, :2], axis=1)) > _MOVING
+    told[~(moving[_SPAN:] & moving[:-_SPAN]), 0] = np.nan
+    return max(_best(felt[:, :1], told[:, :1]), _best(felt[:, 1:], told[:, 1:]))[1]
+
+
+def _felt(grid, t, rate):
+    """Integrals of a rate (n, k) over a span behind each point of the grid, NaN outside."""
+    sums = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None], axis=0)
+    sums = np.vstack([np.zeros(rate.shape[1]), sums])
+    sums = np.column_stack([np.interp(grid, t, s, np.nan, np.nan) for s in sums.T])
+    return sums[_SPAN:] - sums[:-_SPAN]
+
+
+def _told(grid, at, values):
+    """Changes of values (m, k) over a span behind each point of the grid, NaN outside and in
+    gaps."""
+    between = np.clip(np.searchsorted(at, grid), 1, len(at) - 1)
+    gap = at[between] - at[between - 1] > _GAP * max(np.median(np.diff(at)), _SPAN * _GRID)
+    values = np.column_stack([np.interp(grid, at, v, np.nan, np.nan) for v in values.T])
+    values[gap] = np.nan
+    return values[_SPAN:] - values[:-_SPAN]
+
+
+def _best(felt, told):
+    """Correlation and lag (s) of the shift at which what was told (n, k) fits what was felt; the
+    lag is 0 unless it fits well there, and far worse without."""
+    most = min(round(_LARGEST / _GRID), len(felt) // 2)
+    fits = {}
+    for lag in range(-most, most + 1):
+        # What was told at i + lag was felt at i.
+        a, b = (felt[:len(felt) - lag], told[lag:]) if lag >= 0 else (felt[-lag:], told[:lag])
+        fits[lag] = _compare(a, b, 0.3 * np.isfinite(told[:, 0]).sum())
+    best = max(fits, key=lambda lag: fits[lag][0])
+    certain = (abs(best) * _GRID > _APART and fits[best][0] > _CORRELATION
+               and fits[best][1] < _BETTER * fits[0][1])
+    return fits[best][0], best * _GRID if certain else 0.0
+
+
+def _compare(felt, told, fewest):
+    """Correlation of two series of changes (n, k), their means aside, and the mean square that is
+    not explained."""
+    both = np.isfinite(felt[:, 0]) & np.isfinite(told).all(axis=1)
+    if both.sum() < max(_FEWEST, fewest):
+        return 0.0, np.inf
+    felt, told = felt[both], told[both]
+    felt, told = felt - felt.mean(axis=0), told - told.mean(axis=0)
+    size = np.sqrt(np.sum(felt ** 2) * np.sum(told ** 2))
+    return (float(np.sum(felt * told) / size) if size > 0.0 else 0.0,
+            float(np.mean((felt - told) ** 2)))
