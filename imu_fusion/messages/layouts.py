@@ -302,7 +302,3 @@ ODOMETRY = Layout("nav_msgs/msg/Odometry", child=True, position=3, orientation=4
 
 # No headers, no layouts: see convert.bool_message and string_message.
 BOOL_TYPE, STRING_TYPE = "std_msgs/msg/Bool", "std_msgs/msg/String"
-
-LAYOUTS = {layout.msgtype: layout
-           for layout in (
-    IMU, MAG, FIX, TWIST, POSE, POSE_COVARIANCE, ACCEL, VECTOR3, ODOMETRY)}

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from imu_fusion.errors import MessageError
-from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, ODOMETRY
+from imu_fusion.messages.layouts import FIX, IMU, ODOMETRY
 from imu_fusion.messages.typestore import TYPES
+from test.layouts import LAYOUTS
 
 STAMP = 1_700_000_123_456_789_012
 

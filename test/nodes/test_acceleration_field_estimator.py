@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from imu_fusion import batch
 from imu_fusion.errors import ParameterError, TopicError
 from imu_fusion.messages.convert import imu_message
-from imu_fusion.messages.layouts import ACCEL, IMU, LAYOUTS
+from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.nodes.acceleration_field_estimator import AccelerationFieldEstimatorNode
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.parameters.declare import flatten
@@ -22,6 +22,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS, simulate
 from imu_fusion.streams.acceleration_field import OUTPUTS as TYPES
+from test.layouts import LAYOUTS
 from test.nodes.conftest import collector
 
 PRESET = Path(__file__).parents[2] / "config" / "head_four_accelerometers.yaml"

@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from imu_fusion import batch
 from imu_fusion.errors import ParameterError
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
-from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, MAG, VECTOR3
+from imu_fusion.messages.layouts import FIX, IMU, MAG, VECTOR3
 from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode, transform
 from imu_fusion.nodes.replayer import Replayer
@@ -24,6 +24,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from imu_fusion.streams.orientation import OUTPUTS as TYPES
+from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, collector
 
 OUTPUTS = {"/imu/data": Imu, "/imu/rpy/filtered": Vector3Stamped, "/imu/steady_state": Bool,

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError, TopicError
 from imu_fusion.messages.convert import fix_message, imu_message
-from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS
+from imu_fusion.messages.layouts import FIX, IMU
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.nodes.pipeline import run_pipeline
 from imu_fusion.nodes.processes import NodeProcesses
@@ -25,6 +25,7 @@ from imu_fusion.nodes.smoother import SmootherNode
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
+from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, write_bag
 from test.nodes.test_smoother import write
 

@@ -14,13 +14,14 @@ from std_srvs.srv import Trigger
 from imu_fusion import batch
 from imu_fusion.errors import EstimationError, LayoutError, ParameterError
 from imu_fusion.messages.convert import fix_message, imu_message, velocity_message
-from imu_fusion.messages.layouts import FIX, IMU, LAYOUTS, TWIST
+from imu_fusion.messages.layouts import FIX, IMU, TWIST
 from imu_fusion.nodes.flow import END
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.streams.smoother import OUTPUTS, RESULTS_TOPIC, SmootherStream, results_value
+from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, collector
 
 TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix": NavSatFix,

@@ -11,7 +11,6 @@ accelerometers that are not coplanar determine all twelve; fewer channels may de
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -202,19 +201,3 @@ def _orthonormal(values, name):
         raise LayoutError(f"{name}: axes {np.round(axes, 4).tolist()} are not orthonormal; each "
                           "row must be a unit vector, perpendicular to the others")
     return axes
-
-
-def nine_accelerometer_package(arm: float, center: Sequence[float] = (0.0, 0.0, 0.0),
-                               **common: Any) -> tuple[AccelerometerParams, ...]:
-    """AccelerometerParams of the package of Padgaonkar et al. 1975: three at the centre, two on
-    each of three perpendicular arms of length ``arm`` (m), measuring across the arm.
-
-    ``common`` goes to each AccelerometerParams.
-    """
-    middle = np.asarray(center, dtype=float)
-    sensors = [AccelerometerParams(position=tuple(middle), **common)]
-    for axis in range(3):
-        across = tuple(name for i, name in enumerate(AXIS_NAMES) if i != axis)
-        sensors.append(AccelerometerParams(position=tuple(middle + arm * np.eye(3)[axis]),
-                                           measured_axes=across, **common))
-    return tuple(sensors)

@@ -14,7 +14,6 @@ from imu_fusion.estimation.acceleration_field.params import (
 from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, MISSING, SATURATED, field_at
 from imu_fusion.estimation.acceleration_field.sensor_array import (
     make_sensor_array,
-    nine_accelerometer_package,
 )
 from imu_fusion.simulation.rigid_body_impact import (
     PAPER_AXES,
@@ -106,6 +105,16 @@ def _some_axes(positions, measured, axes=None):
             for p, m, a in zip(positions, measured, axes)]
 
 
+def _nine_accelerometer_package(arm, **common):
+    """Padgaonkar et al. 1975: three axes at the centre, two across each of three arms (m)."""
+    sensors = [AccelerometerParams(position=(0.0, 0.0, 0.0), **common)]
+    for axis in range(3):
+        across = tuple(name for i, name in enumerate("xyz") if i != axis)
+        sensors.append(AccelerometerParams(position=tuple(arm * np.eye(3)[axis]),
+                                           measured_axes=across, **common))
+    return sensors
+
+
 def _layouts():
     random = np.random.default_rng(5)
     spread = random.uniform(-0.1, 0.1, (12, 3))
@@ -114,8 +123,8 @@ def _layouts():
         "seven tri-axial, own axes": _some_axes(spread[:7], [("x", "y", "z")] * 7, turned),
         "six bi-axial": _some_axes(spread[:6], [("x", "y"), ("y", "z"), ("x", "z")] * 2, turned),
         "twelve uni-axial": _some_axes(spread, [("x",)] * 12, turned),
-        "nine-accelerometer package": list(nine_accelerometer_package(
-            0.1, noise_density=1e-6, bias_sd=0.0)),
+        "nine-accelerometer package": _nine_accelerometer_package(
+            0.1, noise_density=1e-6, bias_sd=0.0),
     }
 
 
