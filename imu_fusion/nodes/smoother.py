@@ -129,8 +129,13 @@ class SmootherNode(Node):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        p = self.params(SmootherNodeParams)
-        self._stream = SmootherStream(self.params(SmoothingParams), p.memory_limit * 1e6,
+        p, smoothing_params = self.params(SmootherNodeParams), self.params(SmoothingParams)
+        # What is refused is refused before others see a reader of ours and wait for its answer.
+        if smoothing_params.surface.file:
+            load_surface(smoothing_params.surface.file)
+        types = {topic: _class_of(msgtype)
+                 for topic, msgtype in outputs_of(smoothing_params).items()}
+        self._stream = SmootherStream(smoothing_params, p.memory_limit * 1e6,
                                       self.get_logger().warning)
         self._at_end = p.smooth_at_end
         self._flow = Flow(self, on_begin=self._on_begin)
@@ -141,11 +146,8 @@ class SmootherNode(Node):
         for topic, kind in INPUTS.items():
             taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos)
             self._names[taken.topic] = topic
-        surface_file = self.params(SmoothingParams).surface.file
-        if surface_file:
-            load_surface(surface_file)  # a bad file ends the node now
-        self._outputs = {topic: self._flow.output(_class_of(msgtype), topic, _latched(1))
-                         for topic, msgtype in outputs_of(self.params(SmoothingParams)).items()}
+        self._outputs = {topic: self._flow.output(msg_type, topic, _latched(1))
+                         for topic, msg_type in types.items()}
         self._child: Any = None
         self._answer: Any = None  # a Future: (whether it was smoothed, what is said of it)
         self._result = self._messages = None
