@@ -74,8 +74,8 @@ class _Record(np.void):     # type: ignore[misc]
         dtype = super().__getattribute__("dtype")
         if name not in (dtype.names or ()):
             return super().__getattribute__(name)
-        value = self[name]
-        return value.view(np.dtype((_Record, value.dtype))) if dtype[name].names else value
+        value, kind = self[name], dtype[name].base
+        return value.view(np.dtype((_Record, kind))) if kind.names else value
 
     def __setattr__(self, name, value):
         self[name] = value
