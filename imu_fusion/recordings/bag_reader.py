@@ -310,5 +310,3 @@ def find_topic(names: Iterable[str], wanted: str) -> str | None:
         if candidate in names:
             return candidate
     return None
-
-
