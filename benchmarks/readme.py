@@ -77,7 +77,7 @@ def _board(method):
 def rows():
     """List of (what was measured, ours, others, name of the table that holds all of it)."""
     return [
-        ("Orientation of a hand-turned sensor, 9 trials of BROAD against an optical reference: "
+        ("Orientation of a hand-turned sensor, 9 trials of BROAD on which the defaults were chosen, against an optical reference: "
          "RMS, deg",
          f"{_broad('fusion, causal')} live, {_broad('fusion, smoothed')} smoothed",
          f"VQF {_broad('VQF')}, OfflineVQF {_broad('OfflineVQF')}, "
