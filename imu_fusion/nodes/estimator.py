@@ -90,6 +90,10 @@ class EstimatorNode(Node):
             values |= {f"{topic} {why}": n for why, n in refused[topic].items()}
         if not any(taken.values()):
             return DiagnosticStatus.WARN, "no samples yet on " + ", ".join(taken), values
+        remarks = [*stream.findings, *stream.remarks()]
+        values |= {f"remark {k + 1}": text for k, text in enumerate(remarks)}
         if any(refused.values()):
             return DiagnosticStatus.WARN, "samples were left out", values
+        if remarks:
+            return DiagnosticStatus.WARN, "running; see the remarks", values
         return DiagnosticStatus.OK, "running", values

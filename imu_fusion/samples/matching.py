@@ -36,6 +36,7 @@ class SampleMatcher:
         self.late = 0
         self.duplicates = 0
         self.incomplete = 0
+        self.left = 0    # rows that have left
         self._stamps: list[int] = []   # of the waiting rows, ascending
         self._rows: list[Any] = []     # [readings, number of sensors in it]
         self._newest: int | None = None
@@ -87,6 +88,7 @@ class SampleMatcher:
                 or (self._left is not None and first[0] <= self._left + self._tolerance)):
             return None
         self._left = self._newest = int(first[-1])
+        self.left += len(first)
         return first, np.stack([samples[k][1] for k in range(self._shape[0])], axis=1)
 
     def _as_arrays(self, rows: list[Row]) -> Matched:
@@ -112,6 +114,7 @@ class SampleMatcher:
             stamp = self._stamps.pop(0)
             readings, present = self._rows.pop(0)
             self.incomplete += len(present) < self._shape[0]
+            self.left += 1
             self._left = stamp
             leaving.append((stamp, readings))
         return leaving

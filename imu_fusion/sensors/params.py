@@ -51,6 +51,18 @@ SENSOR: dict[str, dict[str, Any]] = {
         unit="m/s^2", low=1e-3, length=(1, 3),
         doc="Largest specific force that the accelerometer reports, one value or one per axis; "
             "unset: taken as never reached."),
+    "acc_position_sd": dict(
+        unit="m", low=0.0, high=0.1,
+        doc="Standard deviation of an accelerometer's place, each coordinate, as states; 0: known "
+            "exactly, no states."),
+    "acc_axes_sd": dict(
+        unit="rad", low=0.0, high=0.5,
+        doc="Standard deviation of how an accelerometer is turned, about each axis, as states; 0: "
+            "known exactly, no states."),
+    "gyro_axes_sd": dict(
+        unit="rad", low=0.0, high=0.5,
+        doc="Standard deviation of how the gyroscope is turned, about each axis, as states; 0: "
+            "known exactly, no states."),
     "axes_sd": dict(
         unit="rad", low=0.0, high=1.0, doc="Uncertainty of the sensor's axes in its case."),
     "mag_noise_sd": dict(

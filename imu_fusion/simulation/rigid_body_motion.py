@@ -6,6 +6,7 @@ estimator says, no more and no less.
 
 import numpy as np
 from scipy.linalg import cholesky
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.acceleration_field.motion_model import mean_rotation, motion_step, parts
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
@@ -17,7 +18,7 @@ from imu_fusion.kernels import njit
 
 @njit
 def _walk(x, quat, h, step, factor, acc_factor, every, white, xs, quats):
-    """Integrate the mean x (18 + m,) and quat (4,) by steps of h s and their noise.
+    """Integrate the mean x (N,) and quat (4,) by steps of h s and their noise.
 
     step: (4, 4) of the chain; factor (4, 4), acc_factor (2, 2): roots of the noise; white:
     (steps, 4, 6). Every ``every`` steps a row of xs and quats is written.
@@ -54,7 +55,7 @@ def draw_motion(params: AccelerationFieldParams, start: Start, samples: int,
         substeps: steps of the integration within one sample interval.
 
     Returns:
-        (states (samples, n) with the biases at the end, quaternions (samples, 4)).
+        (states (samples, N) with biases and mounting at the end, quaternions (samples, 4)).
     """
     mean, cov, quat = start
     variance, vectors = np.linalg.eigh(cov)
@@ -76,14 +77,19 @@ def draw_motion(params: AccelerationFieldParams, start: Start, samples: int,
 
 
 def ideal_readings(array: SensorArray, states: np.ndarray) -> np.ndarray:
-    """Channel readings (n, m) of states (n, 18 + m), with biases and without noise."""
+    """Channel readings (n, m) of states (n, N), with biases and mounting and without noise."""
     s = parts(states)
     out = np.empty((len(states), len(array.channels)))
     for c, channel in enumerate(array.channels):
         u, r = channel["direction"], channel["lever"]
+        turn, shift = channel["turn"], channel["shift"]
+        if turn >= 0:
+            u = Rotation.from_rotvec(states[0, turn:turn + 3]).apply(u)
+        if shift >= 0:
+            r = r + states[0, shift:shift + 3]
         if channel["is_gyro"]:
             out[:, c] = s.omega @ u
         else:
             out[:, c] = (s.acc + np.cross(s.alpha, r)
                          + np.cross(s.omega, np.cross(s.omega, r))) @ u
-    return out + s.bias
+    return out + s.fixed[:, :len(array.channels)]

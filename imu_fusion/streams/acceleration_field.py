@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import EstimationError
+from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
 from imu_fusion.estimation.acceleration_field.params import (
@@ -15,7 +15,12 @@ from imu_fusion.estimation.acceleration_field.params import (
     AccelerometerParams,
     parse_configuration,
 )
-from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED, field_at
+from imu_fusion.estimation.acceleration_field.rows import (
+    LEFT_OUT,
+    MISSING,
+    SATURATED,
+    field_at,
+)
 from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
@@ -36,6 +41,7 @@ POINTS_TOPIC = "acceleration_field/points"
 OUTPUTS = {IMU_TOPIC: IMU.msgtype, ACCEL_TOPIC: ACCEL.msgtype, POINTS_TOPIC: POINT_CLOUD_TYPE}
 # Names below these belong to single sensors, however many there are.
 SENSOR_PREFIXES = ("accelerometers.",)
+_INCOMPLETE = 0.1   # of the samples, that is worth a remark
 _FIELDS = ("x", "y", "z", "ax", "ay", "az", "magnitude")
 
 
@@ -51,6 +57,9 @@ class MatchParams(Parameters):
         0.02, unit="s", low=0.0,
         doc="A sample waits no longer, in stamps of the others, for a missing accelerometer. Raise "
             "it for late networks.")
+    rows_of: str = param(
+        "", doc="Name of an accelerometer: estimates come at its stamps alone. Empty: at every "
+                "stamp, which are several per instant where accelerometers are not stamped alike.")
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,10 @@ class FieldConfiguration:
         stream = FieldStreamParams.from_mapping({k: v for k, v in flat.items() if k in own}, source)
         field, accelerometers = parse_configuration(
             {k: v for k, v in flat.items() if k not in own}, source)
+        rows_of = stream.match.rows_of
+        if rows_of and rows_of not in accelerometers:
+            raise ParameterError(f"parameter 'match.rows_of': no accelerometer '{rows_of}'; there "
+                                 f"are: {', '.join(accelerometers)}")
         return cls(field, stream, accelerometers)
 
     @staticmethod
@@ -174,7 +187,8 @@ class AccelerationFieldStream(Stream):
         self.estimator.reset()
         self.matcher = self.config.make_matcher()
         self._rows: list[np.ndarray] = []
-        self.saturated = self.missing = 0
+        self._asked = np.empty(0, np.int64)    # stamps of rows to come, with match.rows_of
+        self.saturated = self.missing = self.left_out = 0
         self.residual_rms = float("nan")
 
     def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
@@ -198,19 +212,41 @@ class AccelerationFieldStream(Stream):
         return made
 
     def conclude(self) -> Conclusion:
-        """The metrics of impacts, where there are any."""
+        """How the sensors fit, and the metrics of impacts where there are any."""
+        results: dict[str, Any] = {}
+        fits = self.estimator.sensor_fits()
+        if fits:
+            results["accelerometers"] = {fit.name: fit.numbers() for fit in fits}
+        remarks = self.remarks()
+        if remarks:
+            results["remarks"] = remarks
         if not self.config.stream.impact.detect:
-            return Conclusion()
+            return Conclusion(results=results, remarks=remarks)
+        if self._impacts:
+            results["impacts"] = self._impacts
         number = len({impact["stamp"] for impact in self._impacts})
         return Conclusion(
-            results={"impacts": self._impacts} if self._impacts else {},
+            results=results, remarks=remarks,
             summary=f"{number} impacts above {self.config.stream.impact.trigger:g} m/s^2")
+
+    def remarks(self) -> list[str]:
+        found = self.estimator.remarks()
+        if self.matcher.incomplete > _INCOMPLETE * self.matcher.left:
+            match = self.config.stream.match
+            found.append(
+                f"{self.matcher.incomplete} of {self.matcher.left} samples lack an accelerometer: "
+                f"their stamps differ by more than match.tolerance ({match.tolerance:g} s), or "
+                "samples are lost; raise match.tolerance to less than half a sample interval, or "
+                "set match.rows_of for one estimate per instant")
+        return found
 
     def summary(self) -> dict[str, object]:
         """Values for diagnostics."""
+        fits = {f"{fit.name} left out": fit.left_out for fit in self.estimator.sensor_fits()}
         return {"condition number": f"{self.estimator.condition_number:.3g}",
                 "residual rms in units of noise": f"{self.residual_rms:.3g}",
                 "saturated samples": self.saturated, "samples with a channel missing": self.missing,
+                "samples with an accelerometer left out": self.left_out, **fits,
                 "late": self.matcher.late, "duplicates": self.matcher.duplicates,
                 "incomplete": self.matcher.incomplete}
 
@@ -219,14 +255,22 @@ class AccelerationFieldStream(Stream):
             return []
         count = len(self.config.accelerometers)
         gyr = readings[:, count] if self.config.field.use_gyro else None
+        if self.config.stream.match.rows_of:
+            own = readings[:, self._index[f"accelerometers/{self.config.stream.match.rows_of}"]]
+            self._asked = np.append(self._asked, stamp[np.isfinite(own).any(axis=1)])
         return self._write(self.estimator.take(stamp, readings[:, :count], gyr))
 
     def _write(self, rows):
+        if len(rows) and self.config.stream.match.rows_of:
+            last = rows["stamp"][-1]
+            rows = rows[np.isin(rows["stamp"], self._asked)]
+            self._asked = self._asked[self._asked > last]
         if not len(rows):
             return []
         self.residual_rms = float(rows["residual_rms"][-1])
         self.saturated += int(np.sum(rows["flags"] & SATURATED > 0))
         self.missing += int(np.sum(rows["flags"] & MISSING > 0))
+        self.left_out += int(np.sum(rows["flags"] & LEFT_OUT > 0))
         if self.concludes:
             self._rows.append(rows)
         return messages(self.config, rows)

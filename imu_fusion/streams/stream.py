@@ -77,7 +77,7 @@ class Stream:
     whose sensors share a clock (None: all do, see BlockMerger), and implement
     ``restart`` (forget everything), ``use`` (samples of one epoch in, Messages out), ``flush``
     (Messages of what is held back), and where they have something to say ``look_at`` (texts about
-    first samples) and ``conclude``.
+    first samples), ``remarks`` and ``conclude``.
     """
 
     same_frame: ClassVar[tuple[str, ...]] = ()
@@ -99,6 +99,7 @@ class Stream:
         """Start over: with strict merging of these topics, or live (None)."""
         self._merger.begin(session_topics)
         self.frame_ids: dict[str, str] = {}
+        self.findings: list[str] = []   # texts of look_at
         self.restarts = 0
         self._first: dict[str, list[Samples]] = {topic: [] for topic in self.inputs}
         self._seen = dict.fromkeys(self.inputs, 0)  # samples so far, until there are enough
@@ -167,6 +168,10 @@ class Stream:
         """After :meth:`finish`, at the end of a whole recording."""
         return Conclusion()
 
+    def remarks(self) -> list[str]:
+        """Texts on what makes the estimates so far doubtful, each with what to do."""
+        return []
+
     def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
         """Texts about the first samples of ``topic``; ``logs`` maps topics to what there is."""
         return []
@@ -192,7 +197,9 @@ class Stream:
             self._seen[topic] += len(stamp)
             first.append((stamp[:_LOOK_AT - seen], values[:_LOOK_AT - seen]))
             if seen + len(stamp) >= _LOOK_AT:
-                for text in self.look_at(topic, self._first_logs()):
+                found = self.look_at(topic, self._first_logs())
+                self.findings += found
+                for text in found:
                     self.warn(text)
 
     def _first_logs(self) -> dict[str, Any]:

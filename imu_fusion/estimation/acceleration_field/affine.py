@@ -295,7 +295,7 @@ class AffineFilter:
     def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start):
         self._par = kernel_params(params, array)
         self._channels = array.channels
-        self._bias = start.x[BIAS:]
+        self._bias = start.x[BIAS:BIAS + len(array.channels)]
         self._design = np.ascontiguousarray(array.design * self._par["scale"][0])
         self.state = np.zeros(1, STATE)
         self.state["quat"] = start.quat
@@ -312,10 +312,9 @@ class AffineFilter:
         self.state = state.copy()
 
     def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
-        """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
+        """Rows (n,) ROW of samples: stamp (n,), readings (n, m), nan where there is
+        none and inf where they are saturated."""
         rows = np.empty(len(stamp), ROW)
-        # Saturation is judged on what the sensor said, before its bias is taken off.
-        clipped = np.abs(readings) >= self._channels["range"]
-        corrected = np.where(clipped, np.inf, readings - self._bias)
-        advance(self.state, self._par, self._channels, self._design, stamp, corrected, rows)
+        advance(self.state, self._par, self._channels, self._design, stamp, readings - self._bias,
+                rows)
         return rows

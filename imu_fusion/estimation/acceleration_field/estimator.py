@@ -18,15 +18,23 @@ from numpy.typing import ArrayLike
 
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.acceleration_field.affine import AffineFilter
+from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.maximum_likelihood import fit_densities
+from imu_fusion.estimation.acceleration_field.motion_model import BIAS, State, parts
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
     AccelerometerParams,
 )
+from imu_fusion.estimation.acceleration_field.range_limits import RangeLimits
 from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter
 from imu_fusion.estimation.acceleration_field.rigid_body_smoother import smooth
-from imu_fusion.estimation.acceleration_field.rows import ROW
+from imu_fusion.estimation.acceleration_field.rows import ROW, put_still_rows
 from imu_fusion.estimation.acceleration_field.sensor_array import make_sensor_array
+from imu_fusion.estimation.acceleration_field.sensor_faults import (
+    SensorFit,
+    array_remarks,
+    sensor_fits,
+)
 from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
 
 
@@ -48,12 +56,15 @@ class AccelerationFieldEstimator:
                  accelerometers: Sequence[AccelerometerParams] | Mapping[str, AccelerometerParams]):
         sensors = (accelerometers.values() if isinstance(accelerometers, Mapping)
                    else accelerometers)
+        self.names = ([*accelerometers] if isinstance(accelerometers, Mapping)
+                      else [str(k) for k in range(len(sensors))])
         self.params = params
         self.array = make_sensor_array(tuple(sensors), params.sensor, params.use_gyro)
-        if params.method != "rigid_body":
-            self.array = self.array.for_affine_fit(params.max_condition)
+        self.array = (self.array.with_mounting_states() if params.method == "rigid_body"
+                      else self.array.for_affine_fit(params.max_condition))
         self.array.require(params.method, params.max_condition)
         self.fitted = params
+        self._smoothed: State | None = None
         self.reset()
 
     @property
@@ -64,24 +75,63 @@ class AccelerationFieldEstimator:
 
     def reset(self) -> None:
         """Forget all samples and start anew; ``fitted``, what the last maximum likelihood gave,
-        stays."""
+        stays, and so does what :meth:`finish` found of the sensors."""
         self._filter: RigidBodyFilter | AffineFilter | None = None
         self._start: Start | None = None
         self._rest: np.ndarray | None = None
         self._last: int | None = None
         self._stamps: list[np.ndarray] = []
         self._readings: list[np.ndarray] = []
+        self._late: list[np.ndarray] = []    # rows of mode smoothed before its first sample
+        self._limits = RangeLimits(self.array)
+
+    def sensor_fits(self) -> list[SensorFit]:
+        """How each accelerometer fits to the others, by the samples so far (or by those that
+        :meth:`finish` smoothed); none by the methods ao and sqrt_ao, and before the first."""
+        state = self._judged
+        return [] if state is None else sensor_fits(self.names, self.array, state)
+
+    def remarks(self) -> list[str]:
+        """What is wrong with the sensors, and what to do, by the samples so far."""
+        if self.params.method != "rigid_body":
+            return []
+        found = [text for fit in self.sensor_fits() for text in fit.remarks]
+        if self._judged is not None:
+            found += array_remarks(self._judged)
+        unit = {"gyroscope": "rad/s"}
+        for name, limits in self.limits_found.items():
+            known = ", ".join(f"{limit:.6g}" for limit in limits if np.isfinite(limit))
+            where = "sensor.gyro_range" if name == "gyroscope" else f"accelerometers.{name}.range"
+            found.append(f"{name}: stands at its limit of {known} {unit.get(name, 'm/s^2')} and is "
+                         f"not used there: set {where}, and take a sensor of a larger range if the "
+                         "others are at theirs, too")
+        return found
+
+    @property
+    def _judged(self) -> State | None:
+        return (self._filter.state if isinstance(self._filter, RigidBodyFilter)
+                and self.params.mode == "causal" else self._smoothed)
+
+    @property
+    def limits_found(self) -> dict[str, tuple[float, ...]]:
+        """Ranges that were found from flat tops, by accelerometer ("gyroscope" for it), three axes;
+        inf where none was."""
+        names = [*self.names, "gyroscope"]
+        return {names[k]: tuple(own.tolist()) for k, own in enumerate(self._limits.learnt)
+                if np.isfinite(own).any()}
 
     def get_state(self) -> dict[str, Any]:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else self._filter.get_state(),
                 "start": self._start, "rest": self._rest, "last": self._last,
+                "limits": self._limits.found.copy(), "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from where :meth:`get_state` was called, in an estimator of equal parameters."""
         self._start, self._rest, self._last = state["start"], state["rest"], state["last"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
+        self._limits.found, self._late = state["limits"].copy(), list(state["late"])
         self._filter = None
         if state["filter"] is not None:
             self._filter = self._make_filter(self._start)
@@ -96,8 +146,8 @@ class AccelerationFieldEstimator:
             gyr: (3,) rad/s if there is a gyroscope.
 
         Returns:
-            Structured array ROW: the row of this sample; nothing while waiting for rest, and
-            nothing in mode smoothed (see :meth:`finish`).
+            Structured array ROW: the row of this sample; nothing while waiting for rest (those rows
+            come when it is over), and nothing in mode smoothed (see :meth:`finish`).
 
         Raises:
             SampleError: wrong shape, or a stamp that is not later than the previous one.
@@ -127,15 +177,24 @@ class AccelerationFieldEstimator:
                 f"initial.mode rest: the body was never still for {self.params.initial.duration} "
                 "s; give initial.orientation and initial.angular_velocity with initial.mode "
                 "given, or raise initial.still_sd")
-        if self.params.mode != "smoothed" or not self._stamps:
+        if self.params.mode != "smoothed":
             return np.empty(0, ROW)
+        if not self._stamps:
+            rows = np.concatenate([np.empty(0, ROW), *self._late])
+            self.reset()
+            return rows
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
+        limits = RangeLimits(self.array)
+        limits.mark(readings)    # first what the whole recording tells of them
+        readings = self._channels(limits.mark(readings))
         params = self.params
         if params.maximum_likelihood != "off":
             params = fit_densities(params, self.array, self._make_start, stamp, readings)
             self.fitted = params
-        rows = smooth(params, self.array, self._make_start(params), stamp, readings)
+        rows, self._smoothed = smooth(params, self.array, self._make_start(params), stamp, readings)
+        rows = np.concatenate([*self._late, rows])
         self.reset()
+        self._limits = limits
         return rows
 
     def _check(self, stamp, readings, gyr):
@@ -152,40 +211,59 @@ class AccelerationFieldEstimator:
         if len(bad):
             raise SampleError(f"acceleration field: stamp {before[bad[0] + 1]} ns is not later "
                               f"than {before[bad[0]]} ns before it; sort and merge the samples")
-        return stamp, np.ascontiguousarray(flat[:, self.array.channels["column"]])
+        return stamp, flat
 
-    def _take(self, stamp, readings):
-        if len(stamp):
-            self._last = int(stamp[-1])
-        done = 0
+    def _channels(self, flat):
+        """Readings (n, m) of the channels of flattened samples."""
+        return np.ascontiguousarray(flat[:, self.array.channels["column"]])
+
+    def _take(self, stamp, flat):
+        if not len(stamp):
+            return np.empty(0, ROW)
+        self._last = int(stamp[-1])
+        readings = self._channels(self._limits.mark(flat))
+        rows, done = [], 0
         while self._filter is None and done < len(stamp):
             if self.params.initial.mode == "given":
                 self._begin()
             else:
-                self._wait_for_rest(stamp[done:done + 1], readings[done:done + 1])
+                rows.append(self._wait_for_rest(stamp[done:done + 1], readings[done:done + 1]))
                 done += 1
-        if self._filter is None or done == len(stamp):
-            return np.empty(0, ROW)
-        stamp, readings = stamp[done:], readings[done:]
         if self.params.mode == "smoothed":
-            self._stamps.append(stamp)
-            self._readings.append(readings)
+            self._late += rows
+            if self._filter is not None and done < len(stamp):
+                self._stamps.append(stamp[done:])
+                self._readings.append(flat[done:])
             return np.empty(0, ROW)
-        return self._filter.process(stamp, readings)
+        if self._filter is not None and done < len(stamp):
+            rows.append(self._filter.process(stamp[done:], readings[done:]))
+        return rows[0] if len(rows) == 1 else np.concatenate([np.empty(0, ROW), *rows])
 
     def _wait_for_rest(self, stamp, readings):
+        """Take one sample; returns the rows of all since the body is still, once it was so for long
+        enough."""
         self._stamps.append(stamp)
         self._readings.append(readings)
         duration = int(round(self.params.initial.duration * 1e9))
         if self._stamps[-1][0] - self._stamps[0][0] < duration:
-            return
+            return np.empty(0, ROW)
         if is_still(self.params, self.array, np.concatenate(self._readings)):
+            stamps = np.concatenate(self._stamps)
             self._begin()
-            return
+            return self._still_rows(stamps)
         # A quarter of the window at a time: looking again at every sample would cost more than
         # the estimate itself.
         quarter = max(1, len(self._stamps) // 4)
         del self._stamps[:quarter], self._readings[:quarter]
+        return np.empty(0, ROW)
+
+    def _still_rows(self, stamp):
+        start = self._start
+        x = parts(start.x)
+        rows = np.empty(len(stamp), ROW)
+        put_still_rows(kernel_params(self.params, self.array), stamp, start.quat, x.omega, x.alpha,
+                       x.acc, np.ascontiguousarray(start.cov[:BIAS, :BIAS]), rows)
+        return rows
 
     def _begin(self):
         self._rest = np.concatenate(self._readings) if self._readings else None

@@ -18,8 +18,9 @@ def log_likelihood(params: AccelerationFieldParams, array: SensorArray, start: S
                    stamp: np.ndarray, readings: np.ndarray) -> float:
     """Log likelihood of the readings (n, m) at stamps (n,) under the causal filter."""
     keeper = RigidBodyFilter(params, array, start)
-    trace = make_trace(min(CHUNK, len(stamp)), len(array.channels))
-    return sum(keeper.trace(stamp[i:i + CHUNK], readings[i:i + CHUNK], np.empty((0, 3)), trace)
+    trace = make_trace(min(CHUNK, len(stamp)), len(array.channels), len(start.x))
+    return sum(keeper.trace(stamp[i:i + CHUNK], readings[i:i + CHUNK], np.empty((0, len(start.x))), trace,
+                           adaptive=False)
                for i in range(0, len(stamp), CHUNK))
 
 

@@ -2,8 +2,8 @@
 
 An accelerometer channel along the unit vector u at the position r from the reference point
 reads ``u . (a + alpha x r + omega x (omega x r)) + bias`` (Rahaman 2019, eq. (2.33) in body
-axes), a gyroscope channel ``u . omega + bias``. Measurements enter one channel at a time, so
-that no matrix is inverted; each touches at most ten states.
+axes), a gyroscope channel ``u . omega + bias``; u and r are off by the errors of the mounting.
+Measurements enter one channel at a time, so that no matrix is inverted; each touches few states.
 """
 
 import math
@@ -11,16 +11,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.motion_model import ACC, ALPHA, BIAS, OMEGA
-from imu_fusion.estimation.acceleration_field.rows import MISSING, SATURATED
+from imu_fusion.estimation.acceleration_field.adaptation import factor
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ACC,
+    ACC_RATE,
+    ALPHA,
+    BIAS,
+    JERK,
+    OMEGA,
+)
+from imu_fusion.estimation.acceleration_field.rows import LEFT_OUT, MISSING, SATURATED
 from imu_fusion.kernels import njit
 
-# States that one channel touches: omega, alpha, a and its own bias.
-TOUCHED = 10
+# States that one channel touches: omega, alpha, a, its own bias, and its sensor's mounting.
+TOUCHED = 16
 
 
 class Trace(NamedTuple):
-    """What the smoother needs of a stretch of n samples; N = 18 + m states."""
+    """What the smoother needs of a stretch of n samples of N states."""
 
     x: np.ndarray            # (n, N) mean after the sample
     cov: np.ndarray          # (n, N, N) after the sample
@@ -38,12 +46,12 @@ class Innovations(NamedTuple):
     squares: float          # sum of their normalised squares
     log_likelihood: float
     used: int               # channels
-    flags: int              # MISSING, SATURATED
+    flags: int              # MISSING, SATURATED, LEFT_OUT
 
 
-def make_trace(samples: int, channels: int) -> Trace:
-    """An empty :class:`Trace`."""
-    n, size = samples, BIAS + channels
+def make_trace(samples: int, channels: int, size: int) -> Trace:
+    """An empty :class:`Trace` of a state of ``size`` N."""
+    n = samples
     return Trace(np.zeros((n, size)), np.zeros((n, size, size)), np.zeros((n, 3)), np.zeros(n),
                  np.zeros((n, channels, size)), np.zeros((n, channels)),
                  np.zeros((n, channels)), np.zeros((n, channels, TOUCHED)))
@@ -57,34 +65,86 @@ def noise_variance(channel, p):
 
 
 @njit
-def channel_row(channel, c, omega, index, h):
-    """Indices and values of the row of channel number c, linearised at omega (3,).
+def channel_row(channel, c, at, index, h, scratch):
+    """Indices and values of the row of channel number c, linearised at a state ``at`` (N,).
 
-    Returns (number of entries, constant): the reading is h . x[index] + constant.
+    scratch: (3, 3), to work in. Returns (number of entries, reading expected at ``at``).
     """
-    u, r = channel.direction, channel.lever
+    u, r, moment = scratch[0], scratch[1], scratch[2]
+    count = _mounted(channel, at, u, r)
+    omega = at[OMEGA:ALPHA]
+    uw = u[0] * omega[0] + u[1] * omega[1] + u[2] * omega[2]
     if channel.is_gyro:
         for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
             index[i] = OMEGA + i
             h[i] = u[i]
+            moment[i] = u[j] * omega[k] - u[k] * omega[j]
         index[3] = BIAS + c
         h[3] = 1.0
-        return 4, 0.0
-    uw = u[0] * omega[0] + u[1] * omega[1] + u[2] * omega[2]
+        _put_turn(channel, at, moment, index, h, 4)
+        return count - 6, uw + at[BIAS + c]
+    alpha, acc = at[ALPHA:JERK], at[ACC:ACC_RATE]
     rw = r[0] * omega[0] + r[1] * omega[1] + r[2] * omega[2]
     ur = u[0] * r[0] + u[1] * r[1] + u[2] * r[2]
+    ww = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
+    expected = at[BIAS + c]
     for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
         index[i] = OMEGA + i
         h[i] = u[i] * rw + r[i] * uw - 2.0 * ur * omega[i]
         index[3 + i] = ALPHA + i
-        j, k = (i + 1) % 3, (i + 2) % 3
         h[3 + i] = r[j] * u[k] - r[k] * u[j]
         index[6 + i] = ACC + i
         h[6 + i] = u[i]
+        expected += u[i] * acc[i] + h[3 + i] * alpha[i] + 0.5 * h[i] * omega[i]
+        force_j = acc[j] + alpha[k] * r[i] - alpha[i] * r[k] + omega[j] * rw - r[j] * ww
+        force_k = acc[k] + alpha[i] * r[j] - alpha[j] * r[i] + omega[k] * rw - r[k] * ww
+        moment[i] = u[j] * force_k - u[k] * force_j
+        if channel.shift >= 0:
+            index[count - 3 + i] = channel.shift + i
+            h[count - 3 + i] = u[j] * alpha[k] - u[k] * alpha[j] + uw * omega[i] - ww * u[i]
     index[9] = BIAS + c
     h[9] = 1.0
-    # The centripetal part is quadratic, so its value is half its gradient times omega.
-    return 10, -0.5 * (h[0] * omega[0] + h[1] * omega[1] + h[2] * omega[2])
+    _put_turn(channel, at, moment, index, h, 10)
+    return count, expected
+
+
+@njit
+def _mounted(channel, at, u, r):
+    """Direction u (3,) and lever r (3,) of a channel as mounted, by the state ``at``, in place.
+    Returns how many entries the row of an accelerometer has."""
+    count = 10
+    d = channel.direction
+    u[:] = d
+    r[:] = channel.lever
+    if channel.turn >= 0:
+        # A rotation to the second order: to the first, 2 deg would make it longer by 0.1 %.
+        t = at[channel.turn:channel.turn + 3]
+        along = t[0] * d[0] + t[1] * d[1] + t[2] * d[2]
+        size = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            u[i] += t[j] * d[k] - t[k] * d[j] + 0.5 * (along * t[i] - size * d[i])
+        count += 3
+    if channel.shift >= 0:
+        for i in range(3):
+            r[i] += at[channel.shift + i]
+        count += 3
+    return count
+
+
+@njit
+def _put_turn(channel, at, moment, index, h, first):
+    """Entries of the turn of a sensor's axes, from place ``first`` on: moment (3,) is the mounted
+    direction times (cross) what is measured along it."""
+    if channel.turn < 0:
+        return
+    t = at[channel.turn:channel.turn + 3]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        index[first + i] = channel.turn + i
+        h[first + i] = moment[i] - 0.5 * (t[j] * moment[k] - t[k] * moment[j])
 
 
 @njit
@@ -94,49 +154,68 @@ def scalar_update(x, cov, index, h, count, innovation, variance, column):
     Returns the innovation variance.
     """
     n = len(x)
-    for i in range(n):
-        s = 0.0
-        for k in range(count):
-            s += cov[index[k], i] * h[k]
-        column[i] = s
+    column[:] = 0.0
+    for k in range(count):
+        row, value = cov[index[k]], h[k]
+        for i in range(n):
+            column[i] += value * row[i]
     total = variance
     for k in range(count):
         total += h[k] * column[index[k]]
     for i in range(n):
         gain = column[i] / total
+        row = cov[i]
         x[i] += gain * innovation
         for j in range(n):
-            cov[i, j] -= gain * column[j]
+            row[j] -= gain * column[j]
     return total
 
 
 @njit
-def update(state, p, channels, reading, at, trace, n):
-    """Correct the State by all channels of one sample, linearised at the angular velocity ``at``
-    (3,), in place.
-
-    p: record of the parameters, channels: (m,) CHANNEL, reading: (m,) with NaN for missing
-    channels; a channel at its range is not used. The Trace gets sample n. Returns
-    :class:`Innovations`.
-    """
-    index = np.empty(TOUCHED, np.int64)
-    row = np.empty(TOUCHED)
-    squares, log_likelihood, used, flags = 0.0, 0.0, 0, 0
+def linearise(channels, at, work):
+    """Put the rows of all channels, linearised at a state ``at`` (N,), and what they expect there
+    into the Workspace."""
     for c in range(len(channels)):
-        channel = channels[c]
+        work.count[c], work.expected[c] = channel_row(channels[c], c, at, work.index[c],
+                                                      work.row[c], work.scratch)
+
+
+@njit
+def innovation_of(reading, expected, count, index, row, x, at):
+    """What a channel reads beyond what the state x (N,) expects; its row is linearised at ``at``,
+    where ``expected`` is."""
+    innovation = reading - expected
+    for k in range(count):
+        i = index[k]
+        innovation -= row[k] * (x[i] - at[i])
+    return innovation
+
+
+@njit
+def update(state, p, channels, reading, at, work, trace, n):
+    """Correct the State by the channels in use of one sample, in place.
+
+    Args:
+        p: record of the parameters, channels: (m,) CHANNEL, reading: (m,), nan where there is none
+            and inf where it is saturated, at: (N,) the state that ``work`` is linearised at.
+        work: Workspace, whose ``use`` says which channels are in use, and ``doubt`` what is added
+            to the variance of their noise.
+        trace: Trace that gets sample n.
+
+    Returns :class:`Innovations`.
+    """
+    squares, log_likelihood, used, flags = 0.0, 0.0, 0, 0
+    noisiness = factor(state.adaptation[0].noise)
+    for c in range(len(channels)):
         trace.total[n, c] = 0.0
-        if math.isnan(reading[c]):
-            flags |= MISSING
+        if not work.use[c]:
+            flags |= unused_flags(reading[c], False)
             continue
-        if abs(reading[c]) >= channel.range:
-            flags |= SATURATED
-            continue
-        count, constant = channel_row(channel, c, at, index, row)
-        innovation = reading[c] - constant
-        for k in range(count):
-            innovation -= row[k] * state.x[index[k]]
+        count, index, row = work.count[c], work.index[c], work.row[c]
+        innovation = innovation_of(reading[c], work.expected[c], count, index, row, state.x, at)
         total = scalar_update(state.x, state.cov, index, row, count, innovation,
-                              noise_variance(channel, p), trace.column[n, c])
+                              noisiness * noise_variance(channels[c], p) + work.doubt[c],
+                              trace.column[n, c])
         trace.total[n, c] = total
         trace.innovation[n, c] = innovation
         trace.row[n, c] = row
@@ -144,3 +223,13 @@ def update(state, p, channels, reading, at, trace, n):
         log_likelihood -= 0.5 * (math.log(2.0 * math.pi * total) + innovation * innovation / total)
         used += 1
     return Innovations(squares, log_likelihood, used, flags)
+
+
+@njit
+def unused_flags(reading, use):
+    """Why a channel is not used: MISSING, SATURATED, LEFT_OUT; 0 if it is."""
+    if math.isnan(reading):
+        return MISSING
+    if math.isinf(reading):
+        return SATURATED
+    return 0 if use else LEFT_OUT

@@ -1,8 +1,9 @@
 """State of the rigid-body model, and how it moves between samples (numba).
 
-The state is the mean ``x`` (18 + m,), for m measured channels, with its covariance, and a
-quaternion that ``theta`` is relative to. The members of ``x`` are those of :class:`Parts`, in
-this order; rows and columns of the covariance are found by the offsets THETA to BIAS.
+The state is the mean ``x`` (N,) with its covariance, and a quaternion that ``theta`` is relative
+to: N = 18 + m for m measured channels, and three for each sensor's axes and position that may be
+off. The members of ``x`` are those of :class:`Parts`, in this order; rows and columns of the
+covariance are found by the offsets THETA to BIAS. Only the first 18 move.
 
 alpha is a Matern process (or, with rate zero, an integrated Wiener process), the rate of a is a
 Wiener process.
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from imu_fusion.estimation.acceleration_field.adaptation import factor
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.geometry.rotation import (
     quat_exp,
@@ -33,7 +35,7 @@ _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
 
 class Parts(NamedTuple):
-    """Views of a mean, or of many (..., 18 + m): (..., 3) each, body axes."""
+    """Views of a mean, or of many (..., N): (..., 3) each, body axes."""
 
     theta: np.ndarray      # local attitude error, rad: q_true = quat * Exp(theta)
     omega: np.ndarray      # angular velocity, rad/s
@@ -41,16 +43,20 @@ class Parts(NamedTuple):
     jerk: np.ndarray       # its rate, rad/s^3
     acc: np.ndarray        # (specific force or) acceleration at the reference point, m/s^2
     acc_rate: np.ndarray   # its rate, m/s^3
-    bias: np.ndarray       # (..., m) of each channel, in its unit
+    fixed: np.ndarray      # (..., N - 18) biases of the channels in their units, then mounting:
+    #                        turns of axes, rad, and shifts of positions, m
 
 
 class State(NamedTuple):
     """What the filter knows, changed in place."""
 
-    x: np.ndarray      # (18 + m,) mean, see Parts
-    cov: np.ndarray    # (18 + m, 18 + m)
+    x: np.ndarray      # (N,) mean, see Parts
+    cov: np.ndarray    # (N, N)
     quat: np.ndarray   # (4,) world from body
     last: np.ndarray   # (1,) int64 ns, stamp of the last sample; negative before the first
+    checks: np.ndarray   # (K,) CHECK of the accelerometers, see cross_check
+    adaptation: np.ndarray   # (1,) ADAPTATION
+    innovation: np.ndarray   # (m,) of the last sample, before it was used
 
 
 class Step(NamedTuple):
@@ -72,7 +78,7 @@ class Transition(NamedTuple):
 
 @njit
 def parts(x):
-    """The :class:`Parts` of a mean (..., 18 + m)."""
+    """The :class:`Parts` of a mean (..., N)."""
     return Parts(x[..., THETA:OMEGA], x[..., OMEGA:ALPHA], x[..., ALPHA:JERK], x[..., JERK:ACC],
                  x[..., ACC:ACC_RATE], x[..., ACC_RATE:BIAS], x[..., BIAS:])
 
@@ -148,7 +154,7 @@ def transition(dt, chain, phi):
 
 @njit
 def multiply_transition(m, f):
-    """m <- F m in place, m: (18 + m, c), f: Transition."""
+    """m <- F m in place, m: (18 or more, c), f: Transition."""
     step, turn, jac = f.chain, f.turn, f.jac
     for c in range(m.shape[1]):
         t0, t1, t2 = m[THETA, c], m[THETA + 1, c], m[THETA + 2, c]
@@ -170,7 +176,7 @@ def multiply_transition(m, f):
 
 @njit
 def multiply_transition_transposed(m, f):
-    """m <- F' m in place, m: (18 + m, c), f: Transition."""
+    """m <- F' m in place, m: (18 or more, c), f: Transition."""
     step, turn, jac = f.chain, f.turn, f.jac
     for c in range(m.shape[1]):
         t0, t1, t2 = m[THETA, c], m[THETA + 1, c], m[THETA + 2, c]
@@ -204,28 +210,39 @@ def predict(state, p, channels, step):
         x[JERK + i] = chain[3, 2] * alpha + chain[3, 3] * jerk
         x[ACC + i] += dt * x[ACC_RATE + i]
     multiply_transition(cov, f)
-    half = np.ascontiguousarray(cov.T)
+    half = np.ascontiguousarray(cov[:BIAS, :BIAS].T)
     multiply_transition(half, f)
-    for i in range(len(x)):
-        for j in range(i, len(x)):
-            mean = 0.5 * (half[i, j] + half[j, i])
-            cov[i, j] = mean
-            cov[j, i] = mean
-    _add_noise(cov, p, channels, step)
+    put_symmetric(cov, half)
+    wildness = factor(state.adaptation[0].motion)
+    _add_noise(cov, p, channels, step, wildness)
     return phi
 
 
 @njit
-def _add_noise(cov, p, channels, step):
-    """Add what the Step's white noises do to the covariance, in place."""
+def put_symmetric(cov, moving):
+    """Complete a covariance (N, N) whose first 18 rows have been multiplied from the left: its
+    first block is ``moving`` (18, 18) but for rounding, its columns are its rows. In place."""
+    for i in range(BIAS):
+        for j in range(i, BIAS):
+            mean = 0.5 * (moving[i, j] + moving[j, i])
+            cov[i, j] = mean
+            cov[j, i] = mean
+    for i in range(BIAS, len(cov)):
+        for j in range(BIAS):
+            cov[i, j] = cov[j, i]
+
+
+@njit
+def _add_noise(cov, p, channels, step, wildness):
+    """Add what the Step's white noises do to the covariance, in place; wildness: factor on the
+    variances of the motion."""
     dt = step.dt[0]
-    jerk_density = p.motion.jerk_density
-    q = p.motion.acceleration_rate_density * p.motion.acceleration_rate_density
+    jerk = wildness * p.motion.jerk_density * p.motion.jerk_density
+    q = wildness * p.motion.acceleration_rate_density * p.motion.acceleration_rate_density
     for i in range(3):
         for k in range(4):
             for j in range(4):
-                cov[THETA + 3 * k + i, THETA + 3 * j + i] += (
-                    jerk_density * jerk_density * step.noise[k, j])
+                cov[THETA + 3 * k + i, THETA + 3 * j + i] += jerk * step.noise[k, j]
         cov[ACC + i, ACC + i] += q * dt ** 3 / 3.0
         cov[ACC + i, ACC_RATE + i] += 0.5 * q * dt * dt
         cov[ACC_RATE + i, ACC + i] += 0.5 * q * dt * dt
@@ -247,7 +264,7 @@ def gap_variance(omega, dt):
 def reopen(x, cov, dt, spread):
     """After a gap: omega and attitude are held, wider by :func:`gap_variance`; accelerations and
     their rates are as unknown as at the start, with standard deviations ``spread`` (4,) of
-    alpha, its rate, a and its rate; biases stay. In place."""
+    alpha, its rate, a and its rate; biases and mounting stay. In place."""
     turned, speed2 = gap_variance(x[OMEGA:ALPHA], dt)
     kept = cov[OMEGA:ALPHA, OMEGA:ALPHA].copy()
     cov[OMEGA:BIAS, :] = 0.0

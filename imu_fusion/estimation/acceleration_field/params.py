@@ -22,8 +22,15 @@ class Sensor(Parameters):
         "acc_range", None, "A reading of this magnitude or more is saturated and not used.")
     acc_bias_sd: float = sensor("acc_bias_sd", 0.2)
     acc_bias_walk: float = sensor("acc_bias_walk", 0.0)
+    acc_position_sd: float = sensor(
+        "acc_position_sd", 1e-3, "A ruler gives a millimetre; give 0 for a simulation, less for a "
+        "printed circuit.")
+    acc_axes_sd: float = sensor(
+        "acc_axes_sd", 0.035, "Two degrees are what glue and a headform leave; give 0 for a "
+        "simulation, less after a calibration.")
     gyro_axes: tuple[float, ...] = sensor(
         "gyro_axes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    gyro_axes_sd: float = sensor("gyro_axes_sd", 0.035)
     gyro_noise_density: float = sensor("gyro_noise_density", 1e-3)
     gyro_range: tuple[float, ...] | None = sensor(
         "gyro_range", None, "A rate of this magnitude or more is clipped and not used: the "
@@ -48,7 +55,7 @@ class AccelerometerParams(Parameters):
     position: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), unit="m", length=3,
         doc="Position in body coordinates. Errors act like errors of the readings, in proportion "
-            "to angular acceleration and rate squared.")
+            "to angular acceleration and rate squared; position_sd says how large they may be.")
     axes: tuple[float, ...] = param(
         (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), length=9, low=-1, high=1,
         doc="Sensor axes in body coordinates, row by row; orthonormal, either handedness.")
@@ -72,11 +79,18 @@ class AccelerometerParams(Parameters):
     bias_walk: float | None = param(
         None, unit="m/s^2/sqrt(s)", low=0.0, high=10.0,
         doc="Random walk of the bias of each axis; unset: sensor.acc_bias_walk.")
+    position_sd: float | None = param(
+        None, unit="m", low=0.0, high=0.1,
+        doc="Standard deviation of each coordinate of position; unset: sensor.acc_position_sd.")
+    axes_sd: float | None = param(
+        None, unit="rad", low=0.0, high=0.5,
+        doc="Standard deviation of a turn of axes about each of them; unset: sensor.acc_axes_sd.")
 
     def completed(self, common: Sensor) -> "AccelerometerParams":
         """With what is unset from the parameters of all."""
         own = {name: getattr(common, f"acc_{name}")
-               for name in ("noise_density", "range", "bias_sd", "bias_walk")
+               for name in ("noise_density", "range", "bias_sd", "bias_walk", "position_sd",
+                            "axes_sd")
                if getattr(self, name) is None}
         return self.replace(**own)
 

@@ -5,10 +5,20 @@ from typing import NamedTuple
 
 import numpy as np
 
+from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION, adapt
+from imu_fusion.estimation.acceleration_field.cross_check import (
+    CHECK,
+    cross_check,
+    make_workspace,
+)
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
-from imu_fusion.estimation.acceleration_field.measurement import Trace, make_trace, update
+from imu_fusion.estimation.acceleration_field.measurement import (
+    Trace,
+    linearise,
+    make_trace,
+    update,
+)
 from imu_fusion.estimation.acceleration_field.motion_model import (
-    ALPHA,
     BIAS,
     OMEGA,
     THETA,
@@ -65,18 +75,25 @@ def _fold(state):
 
 
 @njit
-def filter_samples(state, par, channels, stamp, readings, rows, trace):
+def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
     """Filter n samples in order, in place; one of ``rows`` (n,) ROW each.
 
     par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, stamp: (n,) int64 ns,
-    readings: (n, m), trace: a Trace of one sample, to work in.
+    readings: (n, m), trace: a Trace of one sample and work: a Workspace, to work in.
     """
     p = par[0]
     step = _make_step()
+    at = np.empty_like(state.x)
     only = np.int64(0)   # a literal 0 would compile what is called once more
     for n in range(len(stamp)):
         flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
-        found = update(state, p, channels, readings[n], state.x[OMEGA:ALPHA].copy(), trace, only)
+        at[:] = state.x
+        linearise(channels, at, work)
+        cross_check(state, p, channels, readings[n], at, work)
+        found = update(state, p, channels, readings[n], at, work, trace, only)
+        if found.used > 0:
+            adapt(state.adaptation[0], found.squares, found.used, work.innovation,
+                  state.innovation)
         _fold(state)
         flags |= found.flags
         residual = math.nan
@@ -94,19 +111,26 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace):
 
 
 @njit
-def trace_samples(state, par, channels, stamp, readings, at, trace):
+def trace_samples(state, par, channels, stamp, readings, at, trace, work, adaptive):
     """As :func:`filter_samples`, but for the smoother: keeps a Trace of all n samples.
 
-    at: (n, 3) angular velocities to linearise at, or (0, 3): at each prediction. Returns the
-    log likelihood of the readings.
+    at: (n, N) states to linearise at, or (0, N): at each prediction; adaptive: bool, whether
+    noise and motion may become larger. Returns the log likelihood of the readings.
     """
     p = par[0]
     step = _make_step()
+    where = np.empty_like(state.x)
     likelihood = 0.0
     for n in range(len(stamp)):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
-        where = at[n].copy() if len(at) > 0 else state.x[OMEGA:ALPHA].copy()
-        likelihood += update(state, p, channels, readings[n], where, trace, n).log_likelihood
+        where[:] = at[n] if len(at) > 0 else state.x
+        linearise(channels, where, work)
+        cross_check(state, p, channels, readings[n], where, work)
+        found = update(state, p, channels, readings[n], where, work, trace, n)
+        likelihood += found.log_likelihood
+        if adaptive and found.used > 0:
+            adapt(state.adaptation[0], found.squares, found.used, work.innovation,
+                  state.innovation)
         trace.x[n] = state.x
         trace.cov[n] = state.cov
         _fold(state)
@@ -119,9 +143,12 @@ class RigidBodyFilter:
     def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start):
         self._par = kernel_params(params, array)
         self._channels = array.channels
-        self._one = make_trace(1, len(array.channels))
+        self._one = make_trace(1, len(array.channels), len(start.x))
+        self._work = make_workspace(array.channels)
+        linearise(array.channels, start.x, self._work)
         self.state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
-                           np.array([-1], dtype=np.int64))
+                           np.array([-1], dtype=np.int64), np.zeros(array.accelerometers, CHECK),
+                           np.zeros(1, ADAPTATION), np.zeros(len(array.channels)))
 
     def get_state(self) -> NamedTuple:
         """A copy of the memory, for :meth:`set_state`."""
@@ -134,10 +161,17 @@ class RigidBodyFilter:
     def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
         rows = np.empty(len(stamp), ROW)
-        filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._one)
+        filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._one,
+                       self._work)
         return rows
 
+    @property
+    def touched(self) -> np.ndarray:
+        """(m, TOUCHED) int, which states the entries of the channels' rows belong to."""
+        return self._work.index
+
     def trace(self, stamp: np.ndarray, readings: np.ndarray, at: np.ndarray,
-              trace: Trace) -> float:
+              trace: Trace, adaptive: bool = True) -> float:
         """:func:`trace_samples` with this filter's memory."""
-        return trace_samples(self.state, self._par, self._channels, stamp, readings, at, trace)
+        return trace_samples(self.state, self._par, self._channels, stamp, readings, at, trace,
+                             self._work, adaptive)

@@ -11,22 +11,23 @@ from imu_fusion.estimation.acceleration_field.measurement import (
     channel_row,
     make_trace,
     noise_variance,
+    unused_flags,
 )
 from imu_fusion.estimation.acceleration_field.motion_model import (
     ALPHA,
     BIAS,
+    State,
     motion_step,
     multiply_transition_transposed,
     parts,
+    put_symmetric,
     transition,
 )
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter
 from imu_fusion.estimation.acceleration_field.rows import (
     GAP,
-    MISSING,
     ROW,
-    SATURATED,
     put_row,
     rigid_gradient,
 )
@@ -46,12 +47,21 @@ class Adjoint(NamedTuple):
     information: np.ndarray   # (N, N)
 
 
+class Smoothed(NamedTuple):
+    """What :func:`smooth_once` gives of n samples."""
+
+    mean: np.ndarray    # (n, N)
+    cov: np.ndarray     # (n, 18, 18)
+    used: np.ndarray    # (n, m) bool, which readings
+    last: State         # after the last sample
+
+
 @njit
-def backward(adjoint, par, channels, trace, smoothed, smoothed_cov):
+def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
     """Smooth the n samples of a Trace, from the last to the first. It inverts nothing, so
     constant biases and exact starts need no care.
 
-    adjoint: :class:`Adjoint`, carries on from the samples after these and ends before these.
+    touched: (m, TOUCHED) states of the channels' rows. adjoint: :class:`Adjoint`, carries on from the samples after these and ends before these.
     smoothed: (n, N); its theta is relative to the predicted attitude. smoothed_cov:
     (n, 18, 18).
     """
@@ -63,7 +73,7 @@ def backward(adjoint, par, channels, trace, smoothed, smoothed_cov):
         smoothed[n] = trace.x[n] - (trace.cov[n] @ vector)[:, 0]
         part = np.ascontiguousarray(trace.cov[n][:BIAS])
         smoothed_cov[n] = part[:, :BIAS] - part @ information @ part.T
-        _before_update(adjoint, channels, trace, n)
+        _before_update(adjoint, touched, trace, n)
         if trace.dt[n] < 0.0:
             # Across a gap, only attitude, omega and biases are the same state.
             vector[ALPHA:BIAS] = 0.0
@@ -74,46 +84,43 @@ def backward(adjoint, par, channels, trace, smoothed, smoothed_cov):
             f = transition(trace.dt[n], chain, trace.phi[n])
             multiply_transition_transposed(vector, f)
             multiply_transition_transposed(information, f)
-            half = np.ascontiguousarray(information.T)
+            half = np.ascontiguousarray(information[:BIAS, :BIAS].T)
             multiply_transition_transposed(half, f)
-            information[:] = 0.5 * (half + half.T)
+            put_symmetric(information, half)
 
 
 @njit
-def _before_update(adjoint, channels, trace, n):
+def _before_update(adjoint, touched, trace, n):
     """Take the Adjoint from behind the updates of sample n to before them."""
     vector, information = adjoint.vector, adjoint.information
-    index = np.empty(TOUCHED, np.int64)
-    unused = np.empty(TOUCHED)
-    for c in range(len(channels) - 1, -1, -1):
+    for c in range(len(touched) - 1, -1, -1):
         total = trace.total[n, c]
         if total == 0.0:
             continue
-        count, _ = channel_row(channels[c], c, unused, index, unused)
-        row = trace.row[n, c]
+        row, index = trace.row[n, c], touched[c]
         gain = trace.column[n, c] / total
         spread = information @ gain
         quadratic = 1.0 / total + np.dot(gain, spread)
         pull = trace.innovation[n, c] / total
         for j in range(len(gain)):
             pull += gain[j] * vector[j, 0]
-        for k in range(count):
+        for k in range(len(row)):
             i, h = index[k], row[k]
             vector[i, 0] -= h * pull
             for j in range(len(gain)):
                 information[i, j] -= h * spread[j]
                 information[j, i] -= h * spread[j]
-        for k in range(count):
-            for j in range(count):
+        for k in range(len(row)):
+            for j in range(len(row)):
                 information[index[k], index[j]] += row[k] * row[j] * quadratic
 
 
 def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, stamp: np.ndarray,
-           readings: np.ndarray) -> np.ndarray:
-    """The iterated smoother: rows (n,) ROW given all samples.
+           readings: np.ndarray) -> tuple[np.ndarray, State]:
+    """The iterated smoother: rows (n,) ROW given all samples, and the State after the last one.
 
-    The readings are linearised at the smoothed angular velocity of the previous iteration
-    (Gauss-Newton on the posterior), until it moves by less than a thousandth of its standard
+    The readings are linearised at the smoothed states of the previous iteration (Gauss-Newton on
+    the posterior), until the angular velocity moves by less than a thousandth of its standard
     deviation or ``iteration.max`` are used up. The attitude is the integral of the smoothed
     angular velocity, by Hermite quadrature and the fourth-order Magnus expansion.
 
@@ -122,54 +129,54 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, st
         stamp: (n,) int64 ns.
         readings: (n, m), NaN for missing channels.
     """
-    at = np.empty((0, 3))
-    before = np.zeros((len(stamp), 3))
+    at = np.empty((0, len(start.x)))
     for iteration in range(params.iteration.max):
-        mean, cov = smooth_once(params, array, start, stamp, readings, at)
-        at = np.ascontiguousarray(parts(mean).omega)
-        moved = np.abs(at - before)
-        variance = parts(np.einsum("nii->ni", cov)).omega
-        if iteration > 0 and np.all(moved ** 2 <= 1e-6 * variance):
-            break
-        before = at
+        found = smooth_once(params, array, start, stamp, readings, at)
+        if iteration > 0:
+            moved = parts(found.mean).omega - parts(at).omega
+            if np.all(moved ** 2 <= 1e-6 * parts(np.einsum("nii->ni", found.cov)).omega):
+                break
+        at = found.mean
     rows = np.empty(len(stamp), ROW)
-    _put_smoothed(kernel_params(params, array), array.channels, stamp, readings, mean, cov,
-                  start.quat.copy(), rows)
-    return rows
+    _put_smoothed(kernel_params(params, array), array.channels, stamp, readings, found.used,
+                  found.mean, found.cov, start.quat.copy(), rows)
+    return rows, found.last
 
 
 def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Start,
                 stamp: np.ndarray, readings: np.ndarray,
-                at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means (n, N) and covariances (n, 18, 18) of one iteration; the arguments are those of
-    :func:`smooth`.
+                at: np.ndarray) -> Smoothed:
+    """One iteration; the arguments are those of :func:`smooth`.
 
-    at: (n, 3) angular velocities to linearise at, or (0, 3): at the filter's predictions.
+    at: (n, N) states to linearise at, or (0, N): at the filter's predictions.
     """
     size, channels = len(start.x), array.channels
     keeper = RigidBodyFilter(params, array, start)
     par = kernel_params(params, array)
-    trace = make_trace(min(CHUNK, len(stamp)), len(channels))
+    trace = make_trace(min(CHUNK, len(stamp)), len(channels), size)
     bounds = [(i, min(i + CHUNK, len(stamp))) for i in range(0, len(stamp), CHUNK)]
     checkpoints = []
     for i, j in bounds:
         checkpoints.append(keeper.get_state())
         keeper.trace(stamp[i:j], readings[i:j], at[i:j], trace)
+    last = keeper.get_state()
     mean = np.empty((len(stamp), size))
     cov = np.empty((len(stamp), BIAS, BIAS))
+    used = np.empty((len(stamp), len(channels)), bool)
     adjoint = Adjoint(np.zeros((size, 1)), np.zeros((size, size)))
     for (i, j), checkpoint in zip(reversed(bounds), reversed(checkpoints)):
         keeper.set_state(checkpoint)
         part = Trace(*(member[:j - i] for member in trace))
         keeper.trace(stamp[i:j], readings[i:j], at[i:j], part)
-        backward(adjoint, par, channels, part, mean[i:j], cov[i:j])
-    return mean, cov
+        backward(adjoint, par, keeper.touched, part, mean[i:j], cov[i:j])
+        used[i:j] = part.total > 0.0
+    return Smoothed(mean, cov, used, last)
 
 
 @njit
-def _put_smoothed(par, channels, stamp, readings, mean, cov, quat, rows):
-    """One of ``rows`` (n,) ROW for each smoothed mean (n, N) and covariance (n, 18, 18); quat
-    (4,) of the start is changed."""
+def _put_smoothed(par, channels, stamp, readings, used, mean, cov, quat, rows):
+    """One of ``rows`` (n,) ROW for each smoothed mean (n, N) and covariance (n, 18, 18); used:
+    (n, m) bool. quat (4,) of the start is changed."""
     p = par[0]
     s = parts(mean)
     quat[:] = quat_normalize(quat_multiply(quat, quat_exp(s.theta[0])))
@@ -186,29 +193,23 @@ def _put_smoothed(par, channels, stamp, readings, mean, cov, quat, rows):
                 phi = (0.5 * dt * (w0 + w1)
                        + dt * dt / 12.0 * (s.alpha[n - 1] - s.alpha[n] + np.cross(w0, w1)))
                 quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
-        _put_residual(row, p, channels, readings[n], mean[n])
+        _put_residual(row, p, channels, readings[n], used[n], mean[n])
         own = parts(mean[n])
         put_row(row, p, quat, own.omega, own.alpha, own.acc, cov[n],
                 rigid_gradient(own.omega, own.alpha))
 
 
 @njit
-def _put_residual(row, p, channels, reading, x):
+def _put_residual(row, p, channels, reading, use, x):
     """Flags and residual_rms of a sample given its smoothed mean x (N,)."""
-    index = np.empty(TOUCHED, np.int64)
-    h = np.empty(TOUCHED)
-    squares, used = 0.0, 0
+    index, h, scratch = np.empty(TOUCHED, np.int64), np.empty(TOUCHED), np.empty((3, 3))
+    squares, count = 0.0, 0
     for c in range(len(channels)):
-        if np.isnan(reading[c]):
-            row.flags |= MISSING
+        row.flags |= unused_flags(reading[c], use[c])
+        if not use[c]:
             continue
-        if abs(reading[c]) >= channels[c].range:
-            row.flags |= SATURATED
-            continue
-        count, constant = channel_row(channels[c], c, parts(x).omega, index, h)
-        residual = reading[c] - constant
-        for k in range(count):
-            residual -= h[k] * x[index[k]]
+        _, expected = channel_row(channels[c], c, x, index, h, scratch)
+        residual = reading[c] - expected
         squares += residual * residual / noise_variance(channels[c], p)
-        used += 1
-    row.residual_rms = np.sqrt(squares / used) if used > 0 else np.nan
+        count += 1
+    row.residual_rms = np.sqrt(squares / count) if count > 0 else np.nan

@@ -24,6 +24,7 @@ MISSING = 1      # a channel had no reading
 SATURATED = 2    # a channel was at its range
 GAP = 4          # the time since the previous sample exceeds gap.max
 HELD = 8         # too few channels: carried on without a fit
+LEFT_OUT = 16    # an accelerometer contradicts the others and was not used
 
 ROW = np.dtype([
     ("stamp", "i8"),
@@ -77,11 +78,25 @@ def put_row(row, p, quat, omega, alpha, acc, cov, gradient):
     row.alpha[:] = alpha
     row.quat[:] = quat
     row.acceleration_world[:] = rotation @ kinematic
-    row.cov_specific_force[:] = force_jacobian @ cov @ force_jacobian.T
+    # Where the sensors are as a whole is known but for this.
+    shifted = p.common_shift_variance * (gradient @ gradient.T)
+    row.cov_specific_force[:] = force_jacobian @ cov @ force_jacobian.T + shifted
     row.cov_omega[:] = cov[OMEGA:ALPHA, OMEGA:ALPHA]
     row.cov_alpha[:] = cov[ALPHA:JERK, ALPHA:JERK]
     row.cov_attitude[:] = cov[THETA:OMEGA, THETA:OMEGA]
-    row.cov_acceleration_world[:] = world_jacobian @ cov @ world_jacobian.T
+    row.cov_acceleration_world[:] = (world_jacobian @ cov @ world_jacobian.T
+                                     + rotation @ shifted @ rotation.T)
+
+
+@njit
+def put_still_rows(par, stamp, quat, omega, alpha, acc, cov, rows):
+    """One of ``rows`` (n,) ROW for each stamp (n,) at which the state was the same; the other
+    arguments are those of :func:`put_row`."""
+    for n in range(len(stamp)):
+        rows[n].stamp = stamp[n]
+        rows[n].flags = 0
+        rows[n].residual_rms = np.nan
+        put_row(rows[n], par[0], quat, omega, alpha, acc, cov, rigid_gradient(omega, alpha))
 
 
 @njit

@@ -15,18 +15,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_fusion.errors import LayoutError
+from imu_fusion.estimation.acceleration_field.motion_model import BIAS
 from imu_fusion.estimation.acceleration_field.params import AXIS_NAMES, AccelerometerParams, Sensor
 
 # Order of the six numbers of the symmetric part: xx yy zz xy xz yz.
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
+# Directions of turning at which an array may tell the angular velocity.
+_TURNINGS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, 1.0, 1.0]])
+
 
 #: One measured axis. ``direction`` (3,) unit vector in body axes; ``lever`` (3,) m from the
 #: reference point; ``density``, ``range``, ``bias_sd``, ``bias_walk`` in units of the sensor;
-#: ``column`` where it stands in a flattened reading.
+#: ``position_sd`` m and ``axes_sd`` rad of its mounting; ``turn`` and ``shift``, the first of the
+#: three states of the error of its axes and of its position, negative if there are none; ``column`` where it stands in a flattened reading, ``sensor`` the number of its
+#: accelerometer (the gyroscope comes last).
 CHANNEL = np.dtype([
     ("direction", "f8", 3), ("lever", "f8", 3), ("density", "f8"), ("range", "f8"),
-    ("bias_sd", "f8"), ("bias_walk", "f8"), ("column", "i8"), ("is_gyro", "?")], align=True)
+    ("bias_sd", "f8"), ("bias_walk", "f8"), ("position_sd", "f8"), ("axes_sd", "f8"),
+    ("turn", "i8"), ("shift", "i8"), ("column", "i8"), ("sensor", "i8"), ("is_gyro", "?")],
+    align=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +84,57 @@ class SensorArray:
         """Condition number of the fit of a and alpha with the angular velocity known."""
         return _condition(self.scaled_design()[:, :6])
 
+    @property
+    def condition_rates(self) -> float:
+        """Condition number of the fit of a, alpha and the angular velocity of a body that turns;
+        inf where only integration tells the latter."""
+        u, r = self.felt["direction"], self.felt["lever"] / max(self.radius, 1e-12)
+        rigid = self.scaled_design()[:, :6]
+        weight = (self.channels["density"].min() / self.felt["density"])[:, None]
+        numbers = []
+        for w in _TURNINGS / np.sqrt(3.0):
+            centripetal = u * (r @ w)[:, None] + r * (u @ w)[:, None] \
+                - 2.0 * np.sum(u * r, axis=1)[:, None] * w
+            numbers.append(_condition(np.hstack([rigid, weight * centripetal])))
+        return min(numbers)
+
+    @property
+    def common_shift_variance(self) -> float:
+        """Variance (m^2) of each coordinate of the weighted mean of all positions.
+
+        No reading tells such a shift of everything: it only renames the point that a belongs to.
+        What a motion model seems to say of it is its own error, so it is no part of the states.
+        """
+        _, first = np.unique(self.felt["sensor"], return_index=True)
+        sd = self.felt["position_sd"][first]
+        return 0.0 if np.any(sd == 0.0) else float(1.0 / np.sum(sd ** -2.0))
+
+    def mounting_covariance(self) -> np.ndarray:
+        """Covariance (k, k) of the states of mounting, which follow the biases."""
+        first = BIAS + len(self.channels)
+        last = max(self.channels["turn"].max(), self.channels["shift"].max())
+        cov = np.zeros((max(last + 3 - first, 0),) * 2)
+        for name, sd in (("turn", "axes_sd"), ("shift", "position_sd")):
+            for channel in self.channels[self.channels[name] >= 0]:
+                own = np.arange(3) + channel[name] - first
+                cov[own, own] = channel[sd] ** 2
+        shifts = np.unique(self.channels["shift"][self.channels["shift"] >= 0]) - first
+        for i in range(3):
+            cov[np.ix_(shifts + i, shifts + i)] -= self.common_shift_variance
+        return cov
+
+    def with_mounting_states(self) -> "SensorArray":
+        """This array with states for the mounting of the sensors that may be off."""
+        channels = self.channels.copy()
+        free = BIAS + len(channels)
+        for number in range(self.accelerometers + 1):
+            own = channels["sensor"] == number
+            for name, sd in (("turn", "axes_sd"), ("shift", "position_sd")):
+                if np.any(channels[sd][own] > 0.0):
+                    channels[name][own] = free
+                    free += 3
+        return replace(self, channels=channels)
+
     def determines_alpha(self, max_condition: float) -> bool:
         """Whether a and alpha follow from the readings although S does not follow entirely."""
         matrix = self.scaled_design()
@@ -110,6 +169,11 @@ class SensorArray:
                     f"accelerometer array: condition number {number:.3g} of the fit of linear and "
                     f"angular acceleration exceeds {max_condition:g}: {self._diagnosis()}; use "
                     "three or more accelerometers that do not lie on one line")
+            if len(self.felt) == len(self.channels) and self.condition_rates > max_condition:
+                raise LayoutError(
+                    f"accelerometer array: {self._diagnosis()}: they do not tell the angular "
+                    "velocity, and integrated from angular acceleration it is lost within seconds; "
+                    "use nine channels or more, or a gyroscope (use_gyro: true)")
             return
         number = self.condition_affine
         if number <= max_condition or (method == "ao" and self.determines_alpha(max_condition)):
@@ -174,7 +238,9 @@ def _accelerometer(k, sensor):
     channels["direction"], channels["lever"] = axes, sensor.position
     channels["density"], channels["range"] = sensor.noise_density, _limit(sensor.range)
     channels["bias_sd"], channels["bias_walk"] = sensor.bias_sd, sensor.bias_walk
-    channels["column"] = 3 * k + np.arange(3)
+    channels["position_sd"], channels["axes_sd"] = sensor.position_sd, sensor.axes_sd
+    channels["turn"] = channels["shift"] = -1
+    channels["column"], channels["sensor"] = 3 * k + np.arange(3), k
     return channels[measured]
 
 
@@ -185,7 +251,9 @@ def _gyroscope(first, common):
     channels["direction"] = _orthonormal(common.gyro_axes, "gyroscope")
     channels["density"], channels["range"] = common.gyro_noise_density, _limit(common.gyro_range)
     channels["bias_sd"], channels["bias_walk"] = common.gyro_bias_sd, common.gyro_bias_walk
-    channels["column"] = first + np.arange(3)
+    channels["axes_sd"] = common.gyro_axes_sd
+    channels["turn"] = channels["shift"] = -1
+    channels["column"], channels["sensor"] = first + np.arange(3), first // 3
     return channels
 
 

@@ -6,6 +6,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
+from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION
+from imu_fusion.estimation.acceleration_field.cross_check import (
+    CHECK,
+    cross_check,
+    make_workspace,
+)
+from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
+from imu_fusion.estimation.acceleration_field.measurement import linearise
 from imu_fusion.estimation.acceleration_field.motion_model import (
     ACC,
     ACC_RATE,
@@ -13,6 +21,7 @@ from imu_fusion.estimation.acceleration_field.motion_model import (
     BIAS,
     OMEGA,
     THETA,
+    State,
     motion_spread,
     parts,
 )
@@ -27,8 +36,8 @@ _STILL_SD = 1e-3
 class Start(NamedTuple):
     """The state before the first sample, see :mod:`.motion_model`."""
 
-    x: np.ndarray      # (18 + m,)
-    cov: np.ndarray    # (18 + m, 18 + m)
+    x: np.ndarray      # (N,)
+    cov: np.ndarray    # (N, N)
     quat: np.ndarray   # (4,) world from body
 
 
@@ -36,12 +45,17 @@ def given_start(params: AccelerationFieldParams, array: SensorArray) -> Start:
     """Start from ``initial.orientation`` and ``initial.angular_velocity``; the accelerations are
     unknown and become known with the first sample."""
     initial = params.initial
-    x = np.zeros(BIAS + len(array.channels))
+    mounting = array.mounting_covariance()
+    moving = BIAS + len(array.channels)
+    x = np.zeros(moving + len(mounting))
     parts(x).omega[:] = initial.angular_velocity
     sd = np.concatenate([
         np.full(3, initial.orientation_sd), np.full(3, initial.angular_velocity_sd),
         np.repeat(motion_spread(params), 3), array.channels["bias_sd"]])
-    return Start(x, np.diag(sd ** 2), normalized(initial.orientation))
+    cov = np.zeros((len(x), len(x)))
+    cov[:moving, :moving] = np.diag(sd ** 2)
+    cov[moving:, moving:] = mounting
+    return Start(x, cov, normalized(initial.orientation))
 
 
 def rest_start(params: AccelerationFieldParams, array: SensorArray,
@@ -53,27 +67,21 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
     The part of the biases that cannot be told from the tilt stays uncertain, correlated with it.
     """
     channels = array.channels
-    m = len(channels)
     x, cov, quat = given_start(params, array)
     parts(x).omega[:] = 0.0
     still = np.r_[THETA:OMEGA, ALPHA:ACC, ACC_RATE:BIAS]
     cov[still, :] = 0.0
     cov[:, still] = 0.0
-    seen = np.isfinite(readings) & (np.abs(readings) < channels["range"])
+    seen = np.isfinite(readings)
     number = seen.sum(axis=0)
-    use = number > 0
-    mean = np.where(seen, readings, 0.0).sum(axis=0)[use] / number[use]
-    rows = np.zeros((m, BIAS + m))
-    rows[:, BIAS:] = np.eye(m)
-    gyro = channels["is_gyro"]
-    felt = channels[~gyro]
-    rows[~gyro, ACC:ACC_RATE] = felt["direction"]
-    rows[~gyro, ALPHA:ALPHA + 3] = np.cross(felt["lever"], felt["direction"])
-    rows[gyro, OMEGA:ALPHA] = channels["direction"][gyro]
+    with np.errstate(invalid="ignore"):
+        mean = np.where(seen, readings, 0.0).sum(axis=0) / number
+    use = _agreeing(params, array, Start(x, cov, quat), mean)
+    rows = _still_rows(array, mean, use, len(x))
     variance = ((params.noise_scale * channels["density"][use]) ** 2 * params.sample_rate
                 / number[use])
-    x, cov = _update(x, cov, rows[use], mean, np.diag(variance))
-    constraint = np.zeros((3, BIAS + m))
+    x, cov = _update(x, cov, rows[use], mean[use], np.diag(variance))
+    constraint = np.zeros((3, len(x)))
     constraint[:, ACC:ACC_RATE] = np.eye(3)
     target = np.zeros(3)
     if array.specific_force:
@@ -91,11 +99,41 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
     return Start(x, cov, quat)
 
 
+def _agreeing(params, array, start, mean):
+    """Mask (m,) of the channels whose mean readings do not contradict the others."""
+    work = make_workspace(array.channels)
+    state = State(start.x, start.cov, start.quat, np.array([-1], dtype=np.int64),
+                  np.zeros(array.accelerometers, CHECK), np.zeros(1, ADAPTATION),
+                  np.zeros(len(array.channels)))
+    linearise(array.channels, start.x, work)
+    cross_check(state, kernel_params(params, array)[0], array.channels, mean, start.x, work)
+    return work.use
+
+
+def _still_rows(array, mean, use, size):
+    """What the channels of a still body measure, linearised: (m, N)."""
+    channels = array.channels
+    m = len(channels)
+    rows = np.zeros((m, size))
+    rows[:, BIAS:BIAS + m] = np.eye(m)
+    gyro = channels["is_gyro"]
+    felt = channels[~gyro]
+    rows[~gyro, ACC:ACC_RATE] = felt["direction"]
+    rows[~gyro, ALPHA:ALPHA + 3] = np.cross(felt["lever"], felt["direction"])
+    rows[gyro, OMEGA:ALPHA] = channels["direction"][gyro]
+    known = use & ~gyro
+    force = np.linalg.lstsq(channels["direction"][known], mean[known], rcond=None)[0]
+    for row, channel in zip(rows, channels):
+        if channel["turn"] >= 0 and not channel["is_gyro"]:
+            row[channel["turn"]:channel["turn"] + 3] = np.cross(channel["direction"], force)
+    return rows
+
+
 def is_still(params: AccelerationFieldParams, array: SensorArray, readings: np.ndarray) -> bool:
     """Whether every channel of ``readings`` (n, m) varies by less than ``initial.still_sd``
     (accelerometers) or ``initial.angular_velocity_sd`` plus noise (gyroscope)."""
     channels = array.channels
-    seen = np.where(np.abs(readings) < channels["range"], readings, np.nan)
+    seen = np.where(np.isfinite(readings), readings, np.nan)
     use = np.isfinite(seen).sum(axis=0) > 1
     if not np.any(use):
         return False

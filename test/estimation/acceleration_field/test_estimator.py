@@ -31,7 +31,7 @@ METHODS = [{"method": "ao"}, {"method": "sqrt_ao"}, {"method": "rigid_body"},
 
 
 def sensors(positions=PAPER_POSITIONS, axes=PAPER_AXES, **common):
-    common = {"noise_density": 1e-6, "bias_sd": 0.0, **common}
+    common = {"noise_density": 1e-6, "bias_sd": 0.0, "position_sd": 0.0, "axes_sd": 0.0, **common}
     return [AccelerometerParams(position=tuple(p), axes=tuple(np.ravel(a)), **common)
             for p, a in zip(positions, axes)]
 
@@ -283,7 +283,7 @@ def test_rest_finds_tilt_and_biases(motion):
     params = AccelerationFieldParams()
     layout = sensors(noise_density=1e-3, bias_sd=0.2)
     rows = AccelerationFieldEstimator(params, layout).run(stamp, readings)
-    assert rows["stamp"][0] == 501_000_000  # after initial.duration
+    assert np.array_equal(rows["stamp"], stamp)  # late, but all of them
     found = Rotation.from_quat(rows["quat"])
     up = found.inv().apply([0, 0, 1.0])
     # The mean bias of the four cannot be told from tilt: 0.2 / sqrt(4) / g = 10 mrad per axis.
@@ -305,7 +305,7 @@ def test_rest_waits_until_the_body_is_still(motion):
     stamp = np.arange(1000) * 1_000_000
     rows = AccelerationFieldEstimator(AccelerationFieldParams(), sensors()).run(stamp, readings)
     # Still from 0.3 s on; windows of 0.5 s move on by a quarter.
-    assert 800 <= rows["stamp"][0] / 1e6 < 930
+    assert 300 <= rows["stamp"][0] / 1e6 < 430
     with pytest.raises(EstimationError, match="never still"):
         AccelerationFieldEstimator(AccelerationFieldParams(), sensors()).run(
             motion.stamp, motion.readings(PAPER_POSITIONS, PAPER_AXES))

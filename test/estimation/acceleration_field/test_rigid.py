@@ -45,9 +45,11 @@ IMPACT = PARAMS.replace(
     motion=Motion(rate=0.0, jerk_density=5e4, acceleration_rate_density=3e3), gravity=9.8)
 
 
-def sensors(noise_density=1e-2, bias_sd=0.3, reports="specific_force", bias_walk=0.0):
+def sensors(noise_density=1e-2, bias_sd=0.3, reports="specific_force", bias_walk=0.0,
+            position_sd=0.0, axes_sd=0.0):
     return [AccelerometerParams(position=tuple(p), axes=tuple(a.ravel()), reports=reports,
-                                noise_density=noise_density, bias_sd=bias_sd, bias_walk=bias_walk)
+                                noise_density=noise_density, bias_sd=bias_sd, bias_walk=bias_walk,
+                                position_sd=position_sd, axes_sd=axes_sd)
             for p, a in zip(PAPER_POSITIONS, PAPER_AXES)]
 
 
@@ -78,7 +80,10 @@ def test_smoother_equals_dense_least_squares():
     readings = ideal_readings(array, xs) + random.normal(0, 0.3, (samples, 12))
     readings[2, 5] = np.nan
     at = xs[:, 3:6] + random.normal(0, 0.1, (samples, 3))
-    mean, cov = smooth_once(PARAMS, array, start, stamp, readings, at)
+    where = np.zeros((samples, 30))    # all else of the model is linear
+    where[:, 3:6] = at
+    mean, cov, used, _ = smooth_once(PARAMS, array, start, stamp, readings, where)
+    assert np.array_equal(used, np.isfinite(readings))
     # Dense: unknowns are omega .. biases of all samples (27 each); theta is not measured.
     size = 27
     step, noise = motion_step(h, RATE)
@@ -130,11 +135,11 @@ def test_smoother_equals_dense_least_squares():
         assert np.abs((cov[n, 3:, 3:] - exact) / np.outer(sd, sd)).max() < 1e-6
 
 
-def _normalised_errors(params, realisations, samples, seed):
+def _normalised_errors(params, realisations, samples, seed, **mounting):
     random = np.random.default_rng(seed)
     total = []
     for _ in range(realisations):
-        estimator = AccelerationFieldEstimator(params, sensors())
+        estimator = AccelerationFieldEstimator(params, sensors(**mounting))
         array = estimator.array
         xs, quats = draw_motion(params, given_start(params, array), samples, random)
         readings = ideal_readings(array, xs) + random.normal(0, 1e-2 * 1000 ** 0.5,
@@ -154,9 +159,10 @@ def _normalised_errors(params, realisations, samples, seed):
 
 
 @pytest.mark.parametrize("mode", ["causal", "smoothed"])
-def test_uncertainty_is_honest(mode):
+@pytest.mark.parametrize("mounting", [{}, {"position_sd": 1e-3, "axes_sd": 0.035}])
+def test_uncertainty_is_honest(mode, mounting):
     realisations = 60
-    found = _normalised_errors(PARAMS.replace(mode=mode), realisations, 120, seed=8)
+    found = _normalised_errors(PARAMS.replace(mode=mode), realisations, 120, seed=8, **mounting)
     # 95 % of chi-square, divided among the five quantities (Bonferroni).
     low, high = chi2.ppf([0.005, 0.995], 3 * realisations) / realisations
     assert np.all((low < found) & (found < high)), found
@@ -209,7 +215,8 @@ def test_clipped_gyroscope_is_filled_in_by_the_accelerometers(impact):
     readings += random.normal(0, 0.3, readings.shape)
     params = IMPACT.replace(**{
         "mode": "smoothed", "initial.angular_velocity_sd": 0.1, "use_gyro": True,
-        "sensor.gyro_noise_density": 3e-4, "sensor.gyro_range": (limit,)})
+        "sensor.gyro_noise_density": 3e-4, "sensor.gyro_range": (limit,),
+        "sensor.gyro_axes_sd": 0.0})
     rows = AccelerationFieldEstimator(params, sensors(1e-2, 0.1)).run(
         impact.stamp, readings, np.clip(gyr, -limit, limit))
     assert np.array_equal(rows["flags"] & SATURATED > 0, clipped.any(axis=1))

@@ -1,0 +1,74 @@
+"""Readings at the end of a sensor's range, which is given or found from flat tops."""
+
+import numpy as np
+
+from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
+from imu_fusion.kernels import njit
+from imu_fusion.sensors.saturation import (
+    FLAT_TOPS,
+    LIMIT_TOLERANCE,
+    find_flat_tops,
+    start_flat_tops,
+)
+
+# No accelerometer has a smaller range than +-2 g, no gyroscope than this.
+_ACC_FLOOR, _GYRO_FLOOR = 19.0, 1.0     # m/s^2, rad/s
+
+
+class RangeLimits:
+    """What is known of the ranges of an array's sensors, by their samples so far.
+
+    ``found`` (K,) FLAT_TOPS, the gyroscope last.
+    """
+
+    def __init__(self, array: SensorArray) -> None:
+        number = int(array.channels["sensor"].max()) + 1
+        self._ranges = np.full((number, 3), np.nan)
+        channels = array.channels[np.isfinite(array.channels["range"])]
+        self._ranges.reshape(-1)[channels["column"]] = channels["range"]
+        self._floors = np.full(number, _ACC_FLOOR)
+        self._floors[array.accelerometers:] = _GYRO_FLOOR
+        self.found = np.zeros(number, FLAT_TOPS)
+        _start(self.found, self._ranges)
+        self.found["tolerance"] = LIMIT_TOLERANCE
+
+    def mark(self, readings: np.ndarray) -> np.ndarray:
+        """Readings (n, 3 K) of all sensors, with inf for those at a limit.
+
+        A limit that is not known is one after some samples at it. A largest value that comes twice
+        in a row is left out even before: no noise is so quiet, and the others fill in.
+        """
+        marked = readings.copy()
+        _mark(self.found, self._ranges, self._floors, marked.reshape(len(readings), -1, 3))
+        return marked
+
+    @property
+    def learnt(self) -> np.ndarray:
+        """Limits (K, 3) that were found, not given; inf where there are none."""
+        return np.where(np.isnan(self._ranges), self.found["limit"], np.inf)
+
+
+@njit
+def _start(found, ranges):
+    for k in range(len(found)):
+        start_flat_tops(found[k], ranges[k])
+
+
+@njit
+def _mark(found, ranges, floors, readings):
+    """Set what is at a limit to inf, in place: readings (n, K, 3)."""
+    sample, last = np.empty(3), np.empty(3)
+    for n in range(len(readings)):
+        for k in range(len(found)):
+            for i in range(3):
+                value = readings[n, k, i]
+                # An axis that is not measured, or has no value, is at no limit.
+                sample[i] = value if np.isfinite(value) else 0.0
+                last[i] = found[k].last[i]
+            clipped = find_flat_tops(found[k], ranges[k], floors[k], sample)
+            for i in range(3):
+                size = abs(sample[i])
+                stands = (sample[i] == last[i] and size > floors[k] and np.isnan(ranges[k, i])
+                          and size >= found[k].largest[i])
+                if clipped >> i & 1 or stands:
+                    readings[n, k, i] = np.inf

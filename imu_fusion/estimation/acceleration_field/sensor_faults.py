@@ -1,0 +1,176 @@
+"""Why an accelerometer contradicts the others, and what its mounting turned out to be: in words."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # its parts are loaded where they are first used
+
+from imu_fusion.estimation.acceleration_field.motion_model import State
+from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
+
+_SAMPLES = 10       # left out: fewer are single wild readings, without a cause to name
+_EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave over
+_STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
+_BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
+_WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFit:
+    """How one accelerometer fits to the others.
+
+    ``samples`` were checked, ``left_out`` of them were not used because it contradicted the others;
+    ``residual`` rms in units of what noise, bias and mounting allow; ``position_error`` (3,) m and
+    ``axes_error`` (3,) rad, estimates with ``_sd``, body axes; nan where there is no such state.
+    ``remarks`` say what is wrong and what to do.
+    """
+
+    name: str
+    samples: int
+    left_out: int
+    residual: float
+    position_error: np.ndarray
+    position_error_sd: np.ndarray
+    axes_error: np.ndarray
+    axes_error_sd: np.ndarray
+    remarks: list[str]
+
+    def numbers(self) -> dict:
+        """Plain numbers for results.json."""
+        return {"samples": self.samples, "left_out": self.left_out, "residual": self.residual,
+                **{name: [None if np.isnan(v) else float(v) for v in getattr(self, name)]
+                   for name in ("position_error", "position_error_sd", "axes_error",
+                                "axes_error_sd")}}
+
+
+def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[SensorFit]:
+    """The SensorFits of an array after the samples that led to ``state``."""
+    found = []
+    for k, name in enumerate(names):
+        own = array.channels[array.channels["sensor"] == k]
+        check = state.checks[k]
+        shift, shift_sd = _states(state, int(own["shift"][0]))
+        turn, turn_sd = _states(state, int(own["turn"][0]))
+        residual = np.sqrt(check["squares"] / check["channels"]) if check["channels"] else np.nan
+        remarks = []
+        if check["left_out"] >= _SAMPLES:
+            remarks.append(
+                f"accelerometer '{name}' contradicts the others in {check['left_out']} of "
+                f"{check['checked']} samples and was left out of them: {_cause(name, check, own)}")
+        else:
+            remarks += _mounting(name, own, shift, turn)
+        found.append(SensorFit(name, int(check["checked"]), int(check["left_out"]),
+                               float(residual), shift, shift_sd, turn, turn_sd, remarks))
+    return found
+
+
+def array_remarks(state: State) -> list[str]:
+    """What is wrong with the sensors as a whole, and what to do."""
+    remarks = []
+    doubted = int(state.checks["doubted"].max())
+    if doubted >= _SAMPLES:
+        remarks.append(
+            f"the accelerometers contradict each other in {doubted} of "
+            f"{state.checks['checked'].max()} samples, and no single one is to blame; these count "
+            "for little: are two of them exchanged, or several positions, axes, units or ranges "
+            "wrong?")
+    adaptation = state.adaptation[0]
+    noise, motion = (float(most) for most in adaptation["most"])
+    if noise > _WIDER:
+        remarks.append(
+            f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
+            f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
+            "jitter of the stamps, flexing, ringing or clipping, or raise noise_scale")
+    if motion > _WIDER:
+        remarks.append(
+            f"the motion is up to {motion:.2g} times wilder than its densities say, for "
+            f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
+            "motion.jerk_density and motion.acceleration_rate_density, or use maximum_likelihood")
+    return remarks
+
+
+def _states(state, first):
+    """Three states and their standard deviations; nan if there are none."""
+    if first < 0:
+        return np.full(3, np.nan), np.full(3, np.nan)
+    own = slice(first, first + 3)
+    return state.x[own].copy(), np.sqrt(np.diag(state.cov)[own])
+
+
+def _mounting(name, own, shift, turn):
+    """Remarks on a mounting that is not as described."""
+    remarks = []
+    # What the data do not tell stays near zero: an estimate far from it is one.
+    if np.any(np.abs(shift) > _BEYOND * own["position_sd"][0]):
+        remarks.append(
+            f"accelerometer '{name}' seems to sit {_vector(1e3 * shift, 1)} mm from its position: "
+            f"correct accelerometers.{name}.position, or raise position_sd")
+    if np.any(np.abs(turn) > _BEYOND * own["axes_sd"][0]):
+        remarks.append(
+            f"accelerometer '{name}' seems to be turned by {_vector(np.degrees(turn), 1)} deg about "
+            f"the body's axes: correct accelerometers.{name}.axes, or raise axes_sd")
+    return remarks
+
+
+def _cause(name, check, own):
+    """Why it contradicts the others, and what to do, by the sums of a CHECK."""
+    expected, product = check["expected"], check["reading"]
+    energy, along = float(np.trace(expected)), float(np.trace(product))
+    squares = float(check["read_squares"])
+    unexplained = float(check["unexplained"])
+    count = int(check["left_out"])
+    spread = squares - float(np.sum(check["read"] ** 2)) / count
+    if spread < _STILL * energy:
+        value = check["read"] / count
+        return (f"it stands still at {_vector(value, 2)} m/s^2: it is dead, disconnected or not "
+                "measured")
+    turn, left = _best_axes(product, squares, energy)
+    if left < _EXPLAINED * unexplained:
+        letters = ["xyz"[int(np.argmax(np.abs(row)))] for row in turn]
+        signs = ["-" if row.sum() < 0 else "" for row in turn]
+        axes = ", ".join(sign + letter for sign, letter in zip(signs, letters))
+        return (f"its axes x, y, z read what is expected of ({axes}): correct "
+                f"accelerometers.{name}.axes")
+    scale = along / energy
+    if squares - scale * along < _EXPLAINED * unexplained:
+        return (f"it reads {scale:.3g} times what is expected: check its unit and its range")
+    shift, explained = _best_shift(check)
+    if unexplained - explained < _EXPLAINED * unexplained:
+        return (f"it seems to sit {_vector(1e3 * shift, 0)} mm from its position: correct "
+                f"accelerometers.{name}.position")
+    turn, left = _best_turn(product, squares, energy)
+    if left < _EXPLAINED * unexplained:
+        angle = np.degrees(scipy.spatial.transform.Rotation.from_matrix(turn).magnitude())
+        return (f"it seems to be turned by {angle:.0f} deg: correct accelerometers.{name}.axes")
+    return "check its mounting, cable, range and description"
+
+
+def _best_axes(product, squares, energy):
+    """The signed permutation (3, 3) of expected axes that the readings follow best, and the squares
+    that it leaves over."""
+    best, left = np.eye(3), np.inf
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = np.diag(signs) @ np.eye(3)[list(order)]
+            remains = squares - 2.0 * float(np.sum(turn * product)) + energy
+            if remains < left:
+                best, left = turn, remains
+    return best, left
+
+
+def _best_turn(product, squares, energy):
+    """As :func:`_best_axes`, any rotation (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(product)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return turn, squares - 2.0 * float(np.sum(turn * product)) + energy
+
+
+def _best_shift(check):
+    """The shift (3,) m of the sensor that explains most, and the squares that it explains."""
+    shift = np.linalg.lstsq(check["place"], check["pull"], rcond=1e-3)[0]
+    return shift, float(shift @ check["pull"])
+
+
+def _vector(values, digits):
+    return "(" + ", ".join(f"{v:.{digits}f}" for v in values) + ")"
