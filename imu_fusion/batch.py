@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import BagError, ImuFusionError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, SampleError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
-from imu_fusion.recordings.results import LEFT_OUT, RECORDING, write_results
+from imu_fusion.recordings.results import FINDINGS, LEFT_OUT, RECORDING, write_results
 from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.stage import Stage, StageReport
@@ -66,7 +67,7 @@ class _Feed:
             if decoded is not None:
                 found[topic] = decoded
                 self._recorded[topic].append((decoded.stamp, kind.values(decoded.values),
-                                              decoded.frame_ids[:1]))
+                                              [*dict.fromkeys(decoded.frame_ids)]))
         try:
             self._hand_on(self._stream.take_decoded(found))
         except BagError:    # of the writer
@@ -82,9 +83,14 @@ class _Feed:
                     np.concatenate([v for _, v, _ in parts]),
                     next((f[0] for _, _, f in parts if f), ""))
                 for topic, parts in self._recorded.items()}
+        frames = {topic: [frame for *_, own in parts for frame in own]
+                  for topic, parts in self._recorded.items()}
         del self._recorded
         try:
-            report.findings = list(self._stage.findings(logs))
+            report.findings = [
+                *(finding for topic, parts in frames.items()
+                  for finding in check_frames(parts, topic)),
+                *self._stage.findings(logs)]
             if report.skipped:
                 return
             self._hand_on(stream.finish())
@@ -118,8 +124,8 @@ class _Feed:
 
 def process(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
             without: Collection[str] = (), remap: Mapping[str, str] | None = None,
-            overwrite: bool = False, progress: Callable[[str], object] = lambda text: None
-            ) -> tuple[list[StageReport], list[str]]:
+            overwrite: bool = False, progress: Callable[[str], object] = lambda text: None,
+            force: bool = False) -> tuple[list[StageReport], list[str]]:
     """Run every estimator whose topics are in a recording and write what it says.
 
     Args:
@@ -130,11 +136,13 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
         remap: dict of topic names of ours to those in the recording.
         overwrite: replace ``out``.
         progress: called with a line of text as things happen.
+        force: estimate from samples that are known to be unusable, too.
 
     Returns:
         (list of StageReport, list of what looks wrong with the recording)
 
     Raises:
+        SampleError: samples make every estimate from them wrong; nothing is written.
         ImuFusionError: recording, parameters or topics are not usable.
     """
     for name in without:
@@ -158,16 +166,28 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
                     f"{report.used[topic]} {name}" for topic, name in names.items()))
                 if report.summary:
                     progress(f"{stage.node}: {report.summary}")
+            unusable = dict.fromkeys(finding.text for report in reports
+                                     for finding in report.findings if finding.unusable)
+            if unusable and not force:
+                raise SampleError(f"{bag}: not usable: " + "; ".join(unusable)
+                                  + ". Nothing was written; --force estimates all the same")
             warnings = list(reader.warnings)
-            results = {report.node: report.results for report in reports if report.results}
-            write_results(writer.directory, results | _left_out(reader, reports))
-    warnings += [text for report in reports for text in report.findings]
+            results: dict[str, Any] = {
+                report.node: report.results for report in reports if report.results}
+            write_results(writer.directory, results | _found(reports) | _left_out(reader, reports))
+    warnings += [finding.text for report in reports for finding in report.findings]
     warnings += [f"{report.node}: {text}" for report in reports
                  for text in (*report.warnings, *report.remarks)]
     return reports, list(dict.fromkeys(warnings))
 
 
-def _left_out(reader: Reader, reports: Sequence[StageReport]) -> dict[str, dict]:
+def _found(reports: Sequence[StageReport]) -> dict[str, Any]:
+    """What looks wrong with the samples, as results.json holds it; empty where nothing does."""
+    found = dict.fromkeys(finding.text for report in reports for finding in report.findings)
+    return {FINDINGS: [*found]} if found else {}
+
+
+def _left_out(reader: Reader, reports: Sequence[StageReport]) -> dict[str, Any]:
     """What was lost or refused, as results.json holds it; empty where nothing was."""
     found: dict[str, Any] = {report.node: report.refused for report in reports if report.refused}
     if reader.damaged:

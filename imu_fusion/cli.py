@@ -115,8 +115,10 @@ def start_node(node: str, arguments: tuple[str, ...]) -> None:
 @without_option
 @remap_option
 @overwrite_option
+@click.option("--force", is_flag=True,
+              help="Estimate even where the samples make it wrong (see info).")
 def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
-            remap: tuple[str, ...], overwrite: bool) -> None:
+            remap: tuple[str, ...], overwrite: bool, force: bool) -> None:
     """Run the estimators on BAG without ROS and write the rosbag2 directory OUT.
 
     An estimator runs if its topics are in the recording. The estimates are those
@@ -125,7 +127,8 @@ def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...
     from imu_fusion import batch
     from imu_fusion.recordings.results import is_incomplete
     reports, warnings = batch.process(bag, out, params_file, without, _remaps(remap), overwrite,
-                                      progress=lambda text: click.echo(text, err=True))
+                                      progress=lambda text: click.echo(text, err=True),
+                                      force=force)
     for warning in warnings:
         click.echo(f"warning: {warning}", err=True)
     table = Table("estimator", "topic", "in", "refused", "out")

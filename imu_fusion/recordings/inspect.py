@@ -12,7 +12,9 @@ from imu_fusion.messages.orientation_status import FLAGS_TYPE
 from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.recordings.logs import LogCollector, undecodable
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
+from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import Log
+from imu_fusion.samples.turning import check_axes
 
 _HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 _LATEST = 2**63 - 1    # of log times, which MCAP counts to twice as far
@@ -38,7 +40,7 @@ class TopicReport:
     msgtype: str
     stamp: np.ndarray = field(repr=False, compare=False)
     ranges: tuple[Range, ...] = ()
-    findings: tuple[checks.Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     stamped: bool = True
     log: Log | None = field(default=None, repr=False, compare=False)
     timing: checks.Timing = field(init=False)
@@ -94,10 +96,12 @@ def inspect_topics(reader: Reader) -> list[TopicReport]:
         msgtype = reader.topics[name].msgtype
         if isinstance(collector, LogCollector):
             report = inspect_log(name, msgtype, collector.log())
+            report = replace(report, findings=(
+                *checks.check_frames(collector.frame_ids, name), *report.findings))
             if collector.refused:
                 text = undecodable(name, collector.refused)
                 reader.lose(text)
-                report = replace(report, findings=(checks.Finding("type", text),
+                report = replace(report, findings=(Finding("type", text),
                                                    *report.findings))
         else:
             report = collector.report(name, msgtype)
@@ -138,7 +142,7 @@ def _with_axes(report, imus):
     if not isinstance(report.log, MagLog) or len(imus) != 1:
         return report
     return replace(report, findings=(*report.findings,
-                                     *checks.check_axes(imus[0], report.log, report.topic)))
+                                     *check_axes(imus[0], report.log, report.topic)))
 
 
 class _Stamps:

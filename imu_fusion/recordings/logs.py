@@ -16,7 +16,8 @@ _BLOCK = 2000    # messages that are decoded at once
 class LogCollector:
     """Makes a log of the messages of one topic, keeping samples and not messages.
 
-    ``refused`` maps reasons for which messages could not be decoded to how many there were.
+    ``refused`` maps reasons for which messages could not be decoded to how many there were;
+    ``frame_ids`` are those that the others name, in order.
     """
 
     def __init__(self, kind: SampleType) -> None:
@@ -24,7 +25,7 @@ class LogCollector:
         self._waiting: list[bytes] = []
         self._stamps = [np.empty(0, np.int64)]
         self._values = [np.empty((0, kind.width))]
-        self._frame_id: str | None = None
+        self.frame_ids: dict[str, None] = {}
         self.refused: dict[str, int] = {}
 
     def add(self, cdr: bytes) -> None:
@@ -37,7 +38,7 @@ class LogCollector:
         """The log of all messages that could be decoded."""
         self._decode()
         return self._kind.log(np.concatenate(self._stamps), np.concatenate(self._values),
-                              self._frame_id or "")
+                              next(iter(self.frame_ids), ""))
 
     def _decode(self) -> None:
         block = self._kind.layout.decode_block(self._waiting)
@@ -47,8 +48,7 @@ class LogCollector:
         if len(block.stamp):
             self._stamps.append(block.stamp)
             self._values.append(self._kind.values(block.values))
-            if self._frame_id is None:
-                self._frame_id = block.frame_ids[0]
+            self.frame_ids |= dict.fromkeys(block.frame_ids)
 
 
 def undecodable(topic: str, refused: Mapping[str, int]) -> str:

@@ -4,13 +4,15 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 RESULTS_FILE = "results.json"
 LEFT_OUT, RECORDING = "left_out", "recording"    # what was not used, of the nodes and as a whole
+FINDINGS = "findings"    # texts on what looks wrong with the samples
 UNDECODABLE = "cannot be decoded"
 
 
-def write_results(directory: str | Path, found: Mapping[str, Mapping]) -> None:
+def write_results(directory: str | Path, found: Mapping[str, Any]) -> None:
     """Write what nodes found; numbers that are not finite become null."""
     (Path(directory) / RESULTS_FILE).write_text(
         json.dumps(_plain(found), indent=2, allow_nan=False))

@@ -7,11 +7,14 @@ Units are told by magnitude: the Earth's field has 22 to 67 microtesla (WMM), gr
 9.83 m/s^2, and both are always there.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
+from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, seconds
+from imu_fusion.samples.turning import check_turning
 
 # Longer than this many usual intervals: at least one sample is missing.
 GAP_FACTOR = 1.8
@@ -25,17 +28,12 @@ _EARTH_T = (20e-6, 70e-6)
 # A flat top lasts three times as long as the values that the axis otherwise repeats (because
 # its steps are coarse, or because a slow sensor is read too often); an axis with fewer
 # distinct values than this is too coarse to tell.
+_ENOUGH = 20        # samples of which all lack something
+_HALVES = 0.2       # share of messages that hold one half alone
+_TURNED = 0.2       # rad: more than a sensor at rest does
+_UPSIDE_DOWN = 0.9  # share of gravity along -z
 _FLAT_TOP = 3
 _DISTINCT = 20
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing worth knowing: ``kind`` (stamp, gap, nan, unit, axes, saturation, held, fix)
-    and ``text`` for people."""
-
-    kind: str
-    text: str
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,8 @@ def check_stamps(stamp: np.ndarray, name: str) -> list[Finding]:
     result = []
     if len(stamp) and not stamp.any():
         return [Finding("stamp", f"{name}: all stamps are zero; the source does not set "
-                                 "header.stamp, and nothing can be estimated from it")]
+                                 "header.stamp, and nothing can be estimated from it",
+                        unusable=True)]
     times = timing(stamp)
     if times.backwards:
         first = int(np.flatnonzero(np.diff(stamp) < 0)[0]) + 1
@@ -243,51 +242,57 @@ def check_field(mag: np.ndarray, name: str) -> list[Finding]:
                             "67e-6 T: not a magnetic field in tesla")]
 
 
-def check_axes(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
-    """A finding if the field does not turn against the gyroscope as it must.
-
-    The direction b of a constant field obeys ``db/dt = b x w`` in sensor axes (Winkler 2025,
-    eq. B.3). The slope of the measured on the predicted change is 1; degrees per second give
-    pi/180, a gyroscope of opposite sign or other axes something else. Both are summed over
-    blocks of a tenth of a second, in which the field turns by more than the magnetometer's noise.
-    """
-    if len(imu) < 3 or len(mag) < 3:
+def check_parts(gyr: np.ndarray, acc: np.ndarray, name: str) -> list[Finding]:
+    """Findings about rates and specific forces (n, 3) of one Imu that are exactly zero: parts that
+    the sensor does not have, or that come in messages of their own. Without rates a sensor that
+    never turns is as well described."""
+    known = np.isfinite(gyr).all(axis=1) & np.isfinite(acc).all(axis=1)
+    if known.sum() < _ENOUGH:
         return []
-    step = seconds(mag.stamp[1:], mag.stamp[0]) - seconds(mag.stamp[:-1], mag.stamp[0])
-    norm = np.linalg.norm(mag.mag, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        direction = mag.mag / norm[:, None]
-    middle = seconds(mag.stamp[:-1], imu.stamp[0]) + 0.5 * step
-    time = seconds(imu.stamp, imu.stamp[0])
-    if np.any(np.diff(time) <= 0) or np.median(step) <= 0:
-        return []  # check_stamps has said so
-    gyr = np.column_stack([np.interp(middle, time, imu.gyr[:, i], left=np.nan, right=np.nan)
-                           for i in range(3)])
-    predicted = np.cross(0.5 * (direction[1:] + direction[:-1]), gyr) * step[:, None]
-    measured = np.diff(direction, axis=0)
-    unusable = (step <= 0) | (step > 0.2)
-    predicted[unusable] = np.nan
-    length = max(int(round(0.1 / np.median(step))), 1)
-    blocks = len(step) // length
-    predicted, measured = (
-        change[:blocks * length].reshape(blocks, length, 3).sum(axis=1)
-        for change in (predicted, measured))
-    usable = np.isfinite(predicted).all(axis=1) & np.isfinite(measured).all(axis=1)
-    predicted, measured = predicted[usable].ravel(), measured[usable].ravel()
-    if not predicted.any() or not measured.any():
-        return []
-    product = float(predicted @ measured)
-    slope = product / float(predicted @ predicted)
-    correlation = product / np.sqrt(float(predicted @ predicted) * float(measured @ measured))
-    if correlation > 0.5 and 0.5 < slope < 2.0:
-        return []
-    if correlation > 0.5 and 0.5 < np.degrees(slope) < 2.0:
-        return [Finding("unit", f"{name}: the field turns {slope:.3g} times as fast as the "
-                                "gyroscope says: angular velocity in deg/s; multiply by pi/180")]
-    if correlation < -0.5:
-        return [Finding("axes", f"{name}: the field turns with the gyroscope instead of against "
-                                "it: one of them has its sign or axes reversed")]
+    turns, feels = gyr[known].any(axis=1), acc[known].any(axis=1)
+    if not turns.any() and feels.any():
+        return [Finding(
+            "lacking", f"{name}: angular velocity is exactly zero throughout: no gyroscope behind "
+            "it. Cameras such as RealSense send it on a topic of its own (.../gyro/sample beside "
+            ".../accel/sample): have the driver unite them (unite_imu_method: 2) and take that "
+            "topic", unusable=_turns(acc[known]))]
+    alone = np.mean(turns & ~feels), np.mean(feels & ~turns)
+    if min(alone) > _HALVES:
+        return [Finding(
+            "lacking", f"{name}: {alone[0]:.0%} of the messages hold an angular velocity alone and "
+            f"{alone[1]:.0%} a specific force alone, the rest of them zeros: two halves of one "
+            "sensor; have the driver unite them by interpolation (RealSense: unite_imu_method: 2)",
+            unusable=True)]
     return []
+
+
+def _turns(acc):
+    """Whether specific forces (n, 3) turn, by means over tenths of the recording."""
+    means = np.array([part.mean(axis=0) for part in np.array_split(acc, 10)])
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+    return bool((means @ means.T).min() < np.cos(_TURNED))
+
+
+def check_gravity_sign(acc: np.ndarray, stamp: np.ndarray, name: str) -> list[Finding]:
+    """A finding if the quietest specific force (n, 3) points along -z."""
+    force = _quiet_mean(acc, stamp)
+    size = float(np.linalg.norm(force))
+    if not force[2] < -_UPSIDE_DOWN * size:
+        return []
+    return [Finding("axes", f"{name}: at rest -z is up ({force[2]:.4g} of {size:.4g} m/s^2): the "
+                            "sensor lies upside down, or the sign of the specific force is "
+                            "reversed (at rest it points up, REP 145)")]
+
+
+def check_frames(frame_ids: Collection[str], name: str) -> list[Finding]:
+    """A finding if messages of one topic name several frames."""
+    named = sorted(set(frame_ids))
+    if len(named) < 2:
+        return []
+    return [Finding("frame", f"{name}: messages of {len(named)} frames ("
+                             + ", ".join(f"'{frame}'" for frame in named[:4])
+                             + "): several sensors on one topic; give each one of its own",
+                    unusable=True)]
 
 
 def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
@@ -297,7 +302,10 @@ def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
              if np.isfinite(part).any()] or [(log.acc, "acceleration")]
     return [*check_stamps(log.stamp, name),
             *(finding for part, what in parts for finding in check_finite(part, name, what)),
+            *check_parts(log.gyr, log.acc, name),
             *check_acceleration(log.acc, log.stamp, name),
+            *check_gravity_sign(log.acc, log.stamp, name),
+            *check_turning(log, name),
             *check_held(np.hstack([log.gyr, log.acc]), log.stamp, name),
             *check_saturation(log.gyr, name, "angular velocity", "rad/s"),
             *check_saturation(log.acc, name, "acceleration", "m/s^2")]
@@ -341,21 +349,33 @@ def _runs(mask):
     return edges[::2], edges[1::2] - edges[::2]
 
 
-def _quiet_norm(values, stamp):
-    """Norm of (n, 3) in the half seconds in which it varies least; NaN if too short.
+def _quiet_blocks(values, stamp):
+    """Means (b, 4) of (n, 3) and its norm in the half seconds in which the norm varies least; none
+    if there are too few samples.
 
-    Noise alone decides which of them is the quietest, and steady braking is as quiet as rest:
-    the median of all that are nearly so.
+    Noise alone decides which of them is the quietest, and steady braking is as quiet as rest: all
+    that are nearly so.
     """
-    norm = np.linalg.norm(np.asarray(values, dtype=np.float64), axis=1)
+    values = np.asarray(values, dtype=np.float64)
+    norm = np.linalg.norm(values, axis=1)
     finite = np.isfinite(norm)
-    norm = norm[finite]
+    together = np.column_stack([values, norm])[finite]
     interval = timing(np.asarray(stamp)[finite]).interval_s
-    if not np.isfinite(interval):
-        return np.nan
-    window = max(int(round(0.5 / interval)), 2)
-    if len(norm) < window:
-        return np.nan
-    blocks = norm[:len(norm) // window * window].reshape(-1, window)
-    spread = blocks.std(axis=1)
-    return float(np.median(blocks[spread <= _AS_QUIET * spread.min()].mean(axis=1)))
+    window = max(int(round(0.5 / interval)), 2) if np.isfinite(interval) else 0
+    if not 0 < window <= len(together):
+        return np.empty((0, 4))
+    blocks = together[:len(together) // window * window].reshape(-1, window, 4)
+    spread = blocks[:, :, 3].std(axis=1)
+    return blocks[spread <= _AS_QUIET * spread.min()].mean(axis=1)
+
+
+def _quiet_norm(values, stamp):
+    """Norm of (n, 3) where it varies least; nan if there are too few samples."""
+    blocks = _quiet_blocks(values, stamp)
+    return float(np.median(blocks[:, 3])) if len(blocks) else np.nan
+
+
+def _quiet_mean(values, stamp):
+    """(3,) where the norm varies least; nan if there are too few samples."""
+    blocks = _quiet_blocks(values, stamp)
+    return np.median(blocks[:, :3], axis=0) if len(blocks) else np.full(3, np.nan)

@@ -31,6 +31,8 @@ from imu_fusion.messages.orientation_status import (
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import ImuLog, MagLog, checks
 from imu_fusion.samples.blocks import Samples, joined
+from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.turning import check_axes, check_turning
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
@@ -314,13 +316,17 @@ class OrientationStream(Stream):
 
     def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
         if topic == IMU_TOPIC:
-            found = checks.check_acceleration(logs[topic].acc, logs[topic].stamp, topic)
+            imu = logs[topic]
+            found = [*checks.check_parts(imu.gyr, imu.acc, topic),
+                     *checks.check_acceleration(imu.acc, imu.stamp, topic),
+                     *checks.check_gravity_sign(imu.acc, imu.stamp, topic),
+                     *check_turning(imu, topic)]
         elif topic == MAG_TOPIC:
             found = checks.check_field(logs[topic].mag, topic)
         else:
             found = checks.check_fix(logs[topic], topic)
         if topic in self.same_frame and all(name in logs for name in self.same_frame):
-            found += checks.check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+            found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
         return [finding.text for finding in found]
 
     def _find_north(self, stamps, values):
@@ -372,8 +378,8 @@ class OrientationStream(Stream):
                 + self._writer.corrected(self.estimator.take_corrected(), frame_id))
 
 
-def findings(logs: Mapping[str, Any]) -> list[str]:
-    """What looks wrong with whole logs: texts.
+def findings(logs: Mapping[str, Any]) -> list[Finding]:
+    """What looks wrong with whole logs.
 
     Args:
         logs: dict of input topic to log, as recorded.
@@ -381,8 +387,8 @@ def findings(logs: Mapping[str, Any]) -> list[str]:
     found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
     if MAG_TOPIC in logs:
         found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
-        found += checks.check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
-    return [finding.text for finding in found]
+        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+    return found
 
 
 STAGE = Stage("orientation_estimator", (OrientationParams, OrientationOutputParams),

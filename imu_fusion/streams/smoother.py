@@ -33,6 +33,8 @@ from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import checks
 from imu_fusion.samples.blocks import Samples, joined
+from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.turning import check_axes
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 from imu_fusion.surfaces.file import load_surface
@@ -390,12 +392,13 @@ def _path(samples, stamp, world):
     return bytes(TYPES.serialize_cdr(path, PATH_TYPE))
 
 
-def findings(logs: Mapping[str, Any]) -> list[str]:
-    """What looks wrong with whole logs as recorded: texts."""
+def findings(logs: Mapping[str, Any]) -> list[Finding]:
+    """What looks wrong with whole logs as recorded."""
     found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC) + checks.check_fix(logs[FIX_TOPIC])
     if MAG_TOPIC in logs:
         found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
-    return [finding.text for finding in found]
+        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+    return found
 
 
 def _configure(stage, params_file):

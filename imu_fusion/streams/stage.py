@@ -9,10 +9,11 @@ from typing import Any
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import parameters_for
+from imu_fusion.samples.findings import Finding
 from imu_fusion.streams.stream import Stream
 
 
-def _no_findings(logs: Mapping) -> list[str]:
+def _no_findings(logs: Mapping) -> list[Finding]:
     return []
 
 
@@ -28,7 +29,7 @@ class Stage:
             cannot run.
         outputs: topic to message type.
         stream: ``(*params, warn=...)`` makes the Stream.
-        findings: ``(logs)`` lists in words what looks wrong with whole logs as recorded.
+        findings: ``(logs)`` lists what looks wrong with whole logs as recorded.
         configure: ``(stage, params_file)`` is (Stage, parameters), where reading the parameters is
             not all: topics may depend on them.
         unusable: why it cannot run, empty if it can.
@@ -41,7 +42,7 @@ class Stage:
     required: tuple[str, ...]
     outputs: Mapping[str, str]
     stream: Callable[..., Stream]
-    findings: Callable[[Mapping], Sequence[str]] = _no_findings
+    findings: Callable[[Mapping], Sequence[Finding]] = _no_findings
     configure: Callable[["Stage", str | Path | None], tuple["Stage", list]] | None = None
     unusable: str = ""
 
@@ -78,7 +79,7 @@ class StageReport:
         skipped: why it did not run, empty if it did.
         summary: a line of text; ``results``: plain numbers of what it found; ``remarks``: texts on
             what makes them doubtful; ``detail``: see Conclusion.
-        findings: texts on what looks wrong with the samples; ``warnings``: on what the estimator
+        findings: on what looks wrong with the samples; ``warnings``: texts on what the estimator
             met.
     """
 
@@ -92,5 +93,5 @@ class StageReport:
     results: dict = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     detail: Any = None
-    findings: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

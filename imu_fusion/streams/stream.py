@@ -18,6 +18,7 @@ from imu_fusion.messages.convert import SampleType
 from imu_fusion.messages.layouts import Decoded
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.blocks import BlockMerger, Samples, joined
+from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Guard, Verdict
 
 
@@ -63,7 +64,8 @@ def one_by_one(made: Iterable[Messages]) -> Iterator[tuple[str, int, bytes]]:
         yield made[k].topic, stamp, made[k].cdrs[i]
 
 
-_LOOK_AT = 500  # first samples of each topic whose units and axes are looked at
+# Samples of each topic after which units and axes are looked at, and for the last time.
+_LOOK_AT, _LOOK_AGAIN = 500, 5000
 
 
 class Stream:
@@ -99,7 +101,8 @@ class Stream:
         """Start over: with strict merging of these topics, or live (None)."""
         self._merger.begin(session_topics)
         self.frame_ids: dict[str, str] = {}
-        self.findings: list[str] = []   # texts of look_at
+        self.findings: list[str] = []   # texts on what looks wrong with the samples
+        self._frames: dict[str, dict[str, None]] = {topic: {} for topic in self.inputs}
         self.restarts = 0
         self._first: dict[str, list[Samples]] = {topic: [] for topic in self.inputs}
         self._seen = dict.fromkeys(self.inputs, 0)  # samples so far, until there are enough
@@ -123,6 +126,9 @@ class Stream:
                 if topic not in self.frame_ids:
                     self.frame_ids[topic] = block.frame_ids[0]
                     self._compare_frames()
+                if not self.concludes:
+                    self._frames[topic] |= dict.fromkeys(block.frame_ids)
+                    self._tell(f.text for f in check_frames(self._frames[topic], topic))
                 samples[topic] = block.stamp, self.inputs[topic].values(block.values)
                 self._look(topic, *samples[topic])
         return self._through(self._merger.add(samples))
@@ -188,19 +194,26 @@ class Stream:
         return made
 
     def _look(self, topic: str, stamp: np.ndarray, values: np.ndarray) -> None:
-        """Have the first samples looked at, once there are enough of them."""
+        """Have the first samples looked at, once there are enough of them, and once again when
+        there are more: whoever lies still at first turns later."""
         if self.concludes:
             return    # whole logs are looked at instead
-        first = self._first[topic]
         seen = self._seen[topic]
-        if seen < _LOOK_AT:
-            self._seen[topic] += len(stamp)
-            first.append((stamp[:_LOOK_AT - seen], values[:_LOOK_AT - seen]))
-            if seen + len(stamp) >= _LOOK_AT:
-                found = self.look_at(topic, self._first_logs())
-                self.findings += found
-                for text in found:
-                    self.warn(text)
+        if seen >= _LOOK_AGAIN:
+            return
+        self._seen[topic] += len(stamp)
+        self._first[topic].append((stamp[:_LOOK_AGAIN - seen], values[:_LOOK_AGAIN - seen]))
+        if any(seen < enough <= self._seen[topic] for enough in (_LOOK_AT, _LOOK_AGAIN)):
+            self._tell(self.look_at(topic, self._first_logs()))
+        if self._seen[topic] >= _LOOK_AGAIN and min(self._seen.values()) >= _LOOK_AGAIN:
+            self._first = {topic: [] for topic in self.inputs}
+
+    def _tell(self, found: Iterable[str]) -> None:
+        """Warn of what has not been told yet."""
+        for text in found:
+            if text not in self.findings:
+                self.findings.append(text)
+                self.warn(text)
 
     def _first_logs(self) -> dict[str, Any]:
         return {topic: self.inputs[topic].log(*joined(parts), self.frame_ids[topic])

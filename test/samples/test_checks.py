@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.samples import checks
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
+from imu_fusion.samples.turning import check_axes
 
 RATE = 100
 GRAVITY_WORLD = np.array([0.0, 0.0, 9.81])
@@ -37,7 +38,7 @@ def test_a_good_recording_has_no_findings():
     imu, mag = recording()
     assert checks.check_imu(imu) == []
     assert checks.check_mag(mag) == []
-    assert checks.check_axes(imu, mag, "imu/mag") == []
+    assert check_axes(imu, mag, "imu/mag") == []
 
 
 def test_timing_counts_gaps_repeats_and_steps_back():
@@ -112,22 +113,22 @@ def test_odd_fields_are_told_apart():
 
 def test_gyroscope_in_degrees_and_reversed_is_seen_by_the_field():
     imu, mag = recording()
-    (finding,) = checks.check_axes(ImuLog(imu.stamp, np.degrees(imu.gyr), imu.acc), mag, "imu/mag")
+    (finding,) = check_axes(ImuLog(imu.stamp, np.degrees(imu.gyr), imu.acc), mag, "imu/mag")
     assert finding.kind == "unit" and "deg/s" in finding.text
-    (finding,) = checks.check_axes(ImuLog(imu.stamp, -imu.gyr, imu.acc), mag, "imu/mag")
+    (finding,) = check_axes(ImuLog(imu.stamp, -imu.gyr, imu.acc), mag, "imu/mag")
     assert finding.kind == "axes"
 
 
 def test_axes_are_judged_in_spite_of_a_noisy_magnetometer_and_not_at_rest():
     # 1 uT of noise: more than the field turns by from sample to sample.
     imu, mag = recording(mag_noise=1e-6)
-    assert checks.check_axes(imu, mag, "m") == []
+    assert check_axes(imu, mag, "m") == []
     degrees = ImuLog(imu.stamp, np.degrees(imu.gyr), imu.acc)
-    assert kinds(checks.check_axes(degrees, mag, "m")) == ["unit"]
-    assert checks.check_axes(degrees[:90], mag[:90], "m") == []  # at rest: nothing to tell by
+    assert kinds(check_axes(degrees, mag, "m")) == ["unit"]
+    assert check_axes(degrees[:90], mag[:90], "m") == []  # at rest: nothing to tell by
     # An empty, a short and a stuck log have no axes to judge.
     for bad in (mag[:0], mag[:2], MagLog(np.zeros(50, np.int64), mag.mag[:50])):
-        assert checks.check_axes(imu, bad, "m") == []
+        assert check_axes(imu, bad, "m") == []
 
 
 def test_clipped_peaks_are_saturation_and_round_peaks_are_not():
@@ -162,6 +163,35 @@ def test_values_that_are_not_finite_are_counted():
     findings = checks.check_imu(ImuLog(imu.stamp, imu.gyr, acc))
     (finding,) = [f for f in findings if f.kind == "nan"]
     assert "2 of 2000" in finding.text and "sample 5" in finding.text and kinds(findings) == ["nan"]
+
+
+def test_a_missing_gyroscope_and_halves_of_a_sensor_are_told():
+    imu, _ = recording()
+    (finding,) = [f for f in checks.check_imu(ImuLog(imu.stamp, 0 * imu.gyr, imu.acc))
+                  if f.kind == "lacking"]
+    assert "no gyroscope" in finding.text and "RealSense" in finding.text and finding.unusable
+    alternate = (np.arange(len(imu)) % 2 == 0)[:, None]
+    (finding,) = checks.check_parts(imu.gyr * alternate, imu.acc * ~alternate, "imu")
+    assert "50% of the messages" in finding.text and finding.unusable
+    # An Imu without accelerometer, and single lost samples, are neither.
+    assert checks.check_parts(imu.gyr, 0 * imu.acc, "imu") == []
+    lost = imu.acc.copy()
+    lost[::50] = 0.0
+    assert checks.check_parts(imu.gyr, lost, "imu") == []
+
+
+def test_gravity_that_points_down_is_told():
+    imu, _ = recording()
+    still = imu[:100]
+    assert checks.check_gravity_sign(still.acc, still.stamp, "imu") == []
+    (finding,) = checks.check_gravity_sign(-still.acc, still.stamp, "imu")
+    assert "-z is up" in finding.text and not finding.unusable
+
+
+def test_two_frames_on_one_topic_are_told():
+    assert checks.check_frames(["imu", "imu"], "imu") == checks.check_frames([], "imu") == []
+    (finding,) = checks.check_frames({"imu": None, "other": None}, "imu/data_raw")
+    assert "'imu', 'other'" in finding.text and finding.unusable
 
 
 def test_no_fix_at_all_is_told():

@@ -14,16 +14,18 @@ import numpy as np
 from imu_fusion.kernels import njit
 
 #: ``noise`` and ``motion``: summed excess of the squares of either kind; ``product`` and ``square``
-#: of innovations with those of the sample before, fading; ``samples`` in which something was taken
+#: of innovations with those of the sample before, fading; ``grace``: samples for which nothing is
+#: judged yet; ``samples`` in which something was taken
 #: to be larger, and how much the ``most`` was, as a factor on standard deviations, of each kind.
 ADAPTATION = np.dtype([
     ("noise", "f8"), ("motion", "f8"), ("product", "f8"), ("square", "f8"),
-    ("samples", "i8", 2), ("most", "f8", 2)], align=True)
+    ("grace", "i8"), ("samples", "i8", 2), ("most", "f8", 2)], align=True)
 
 _EXPECTED = 1.5     # mean square of a channel's innovation that is no excess, in its variances
 _CHANCE = 6.0       # summed excess of twelve channels that chance makes once in many days
 _SLOWNESS = 20.0    # excess that makes a variance e times larger
 _LARGEST = 280.0    # excess beyond which nothing grows
+GRACE = 30          # samples after a start or a gap, in which linearisation is to blame
 _MEMORY = 0.9       # of products, from sample to sample
 
 
@@ -31,6 +33,14 @@ _MEMORY = 0.9       # of products, from sample to sample
 def factor(excess):
     """By how much a variance is taken to be larger."""
     return math.exp((excess - _CHANCE) / _SLOWNESS) if excess > _CHANCE else 1.0
+
+
+@njit
+def _summed(total, excess, is_its):
+    """The summed excess with that of one more sample; what was large goes the faster."""
+    if excess > 0.0:
+        return min(total + excess, _LARGEST) if is_its else total
+    return max(total + excess * max(1.0, total / _SLOWNESS), 0.0)
 
 
 @njit
@@ -44,12 +54,13 @@ def adapt(adaptation, squares, used, innovation, last):
         last[c] = innovation[c]
     adaptation.product = _MEMORY * adaptation.product + product
     adaptation.square = _MEMORY * adaptation.square + square
+    if adaptation.grace > 0:
+        adaptation.grace -= 1
+        return
     excess = squares / used - _EXPECTED
     is_motion = adaptation.product > 0.3 * adaptation.square
-    noise = excess if excess < 0.0 or not is_motion else 0.0
-    motion = excess if excess < 0.0 or is_motion else 0.0
-    adaptation.noise = min(max(adaptation.noise + noise, 0.0), _LARGEST)
-    adaptation.motion = min(max(adaptation.motion + motion, 0.0), _LARGEST)
+    adaptation.noise = _summed(adaptation.noise, excess, not is_motion)
+    adaptation.motion = _summed(adaptation.motion, excess, is_motion)
     for i, grown in enumerate((factor(adaptation.noise), factor(adaptation.motion))):
         adaptation.samples[i] += grown > 1.0
         adaptation.most[i] = max(adaptation.most[i], math.sqrt(grown))

@@ -21,16 +21,18 @@ from imu_fusion.estimation.acceleration_field.motion_model import ACC, ALPHA, OM
 from imu_fusion.kernels import njit
 
 #: What is kept of one accelerometer: samples in which it was ``checked``, ``left_out`` of them, and
-#: ``doubted`` with all others;
-#: ``squares`` of its ``channels`` channel samples, what the fit leaves over in units of what it may
-#: leave; ``evidence`` against it, whether it is ``faulty`` now, and ``out`` of the present sample. Sums over samples left out, in
-#: its own axes: of ``expected`` e by the others and of the reading y: e e', ``reading`` y e',
-#: ``read`` y and ``read_squares`` y^2, ``unexplained`` (y - e)^2; normal equations ``place`` and ``pull`` of the shift of its position that would
-#: explain it.
+#: ``doubted`` with all others; ``squares`` of its ``channels`` channel samples, what the fit leaves
+#: over in units of what it may leave; ``evidence`` against it, whether it is ``faulty`` now, and
+#: ``out`` of the present sample. Sums over samples left out, in its own axes, of what the others
+#: ``expected`` e and of the reading y: e e', ``reading`` y e', ``read`` y and ``read_squares`` y^2,
+#: ``unexplained`` (y - e)^2; normal equations ``place`` and ``pull`` of the shift of its position
+#: that would explain it.
 CHECK = np.dtype([
-    ("checked", "i8"), ("left_out", "i8"), ("doubted", "i8"), ("squares", "f8"), ("channels", "i8"),
-    ("evidence", "f8"), ("faulty", "?"), ("out", "?"), ("expected", "f8", (3, 3)), ("reading", "f8", (3, 3)),
-    ("read", "f8", 3), ("read_squares", "f8"), ("unexplained", "f8"), ("place", "f8", (3, 3)), ("pull", "f8", 3)], align=True)
+    ("checked", "i8"), ("left_out", "i8"), ("doubted", "i8"), ("squares", "f8"),
+    ("channels", "i8"), ("evidence", "f8"), ("faulty", "?"), ("out", "?"),
+    ("expected", "f8", (3, 3)), ("reading", "f8", (3, 3)), ("read", "f8", 3),
+    ("read_squares", "f8"), ("unexplained", "f8"), ("place", "f8", (3, 3)), ("pull", "f8", 3)],
+    align=True)
 
 # Standard deviations by which what is left over may exceed zero.
 _GATE = 5.0
@@ -53,9 +55,9 @@ class Fit(NamedTuple):
 class Workspace(NamedTuple):
     """What one sample is worked on in; says nothing of the sample before."""
 
-    index: np.ndarray      # (m, TOUCHED) states that the rows of the channels touch
-    row: np.ndarray        # (m, TOUCHED) their values, see measurement.linearise; 0 beyond count
-    count: np.ndarray      # (m,) int, entries
+    touched: np.ndarray    # (m, TOUCHED) states that the rows of the channels touch
+    row: np.ndarray        # (m, TOUCHED) their values, see measurement.linearise; 0 beyond entries
+    entries: np.ndarray    # (m,) int, how many of them
     expected: np.ndarray   # (m,) readings where they are linearised
     scratch: np.ndarray    # (3, 3)
     design: np.ndarray     # (m, 6) of a and alpha (times the radius); 0 of gyroscopes
@@ -153,8 +155,8 @@ def cross_check(state, p, channels, reading, at, work):
         work.innovation[c] = 0.0
         if math.isfinite(reading[c]):
             work.innovation[c] = innovation_of(
-                reading[c], work.expected[c], work.count[c], work.index[c], work.row[c], state.x,
-                at)
+                reading[c], work.expected[c], work.entries[c], work.touched[c], work.row[c],
+                state.x, at)
     if work.fit.redundancy[0] > 0:
         _allow(state, p, channels, reading, work)
         worst = _worst(work.fit, work)
@@ -167,13 +169,13 @@ def cross_check(state, p, channels, reading, at, work):
         work.doubt[c] = doubt * work.variance[c]
         work.use[c] = math.isfinite(reading[c]) and (channels[c].is_gyro or work.fit.used[c]
                                                      or work.fit.redundancy[0] < 0)
-    _add_second_order(state, channels, work)
 
 
 @njit
-def _add_second_order(state, channels, work):
-    """Add to ``work.doubt`` what errors of mounting do where what they multiply is not known yet,
-    at the start and after gaps: products of two errors, which no linearisation sees."""
+def doubt_second_order(state, channels, work):
+    """Add to ``work.doubt`` products of two errors, which no linearisation sees: of the mounting
+    and of what it multiplies, and of the angular velocity with itself. They count at the start and
+    after gaps, where readings are linearised at predictions."""
     cov = state.cov
     spin, turning, force = 0.0, 0.0, 0.0
     for i in range(3):
@@ -193,6 +195,8 @@ def _add_second_order(state, channels, work):
         lever = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
         felt = spin if channel.is_gyro else force + lever * turning
         work.doubt[c] += 2.0 / 9.0 * (turned * felt + shifted * turning)
+        if not channel.is_gyro:
+            work.doubt[c] += 0.5 * lever * spin * spin
 
 
 @njit
@@ -322,7 +326,7 @@ def _add_evidence(check, sensor, channels, reading, work):
         moves |= abs(expected[axis]) > 2.0 * limit
         check.unexplained += left * left
         # The derivative by a shift of the sensor stands last in the row, where there is one.
-        h = work.row[c, work.count[c] - 3:work.count[c]]
+        h = work.row[c, work.entries[c] - 3:work.entries[c]]
         for i in range(3):
             check.pull[i] += h[i] * left
             for j in range(3):

@@ -249,16 +249,14 @@ class AccelerationFieldEstimator:
             return np.empty(0, ROW)
         if is_still(self.params, self.array, np.concatenate(self._readings)):
             stamps = np.concatenate(self._stamps)
-            self._begin()
-            return self._still_rows(stamps)
+            return self._still_rows(stamps, self._begin())
         # A quarter of the window at a time: looking again at every sample would cost more than
         # the estimate itself.
         quarter = max(1, len(self._stamps) // 4)
         del self._stamps[:quarter], self._readings[:quarter]
         return np.empty(0, ROW)
 
-    def _still_rows(self, stamp):
-        start = self._start
+    def _still_rows(self, stamp, start):
         x = parts(start.x)
         rows = np.empty(len(stamp), ROW)
         put_still_rows(kernel_params(self.params, self.array), stamp, start.quat, x.omega, x.alpha,
@@ -270,6 +268,7 @@ class AccelerationFieldEstimator:
         self._start = self._make_start(self.params)
         self._filter = self._make_filter(self._start)
         self._stamps, self._readings = [], []
+        return self._start
 
     def _make_start(self, params):
         if self._rest is None:

@@ -17,10 +17,10 @@ from imu_fusion.estimation.acceleration_field.start import Start
 def log_likelihood(params: AccelerationFieldParams, array: SensorArray, start: Start,
                    stamp: np.ndarray, readings: np.ndarray) -> float:
     """Log likelihood of the readings (n, m) at stamps (n,) under the causal filter."""
-    keeper = RigidBodyFilter(params, array, start)
+    keeper = RigidBodyFilter(params, array, start, is_adaptive=False)
     trace = make_trace(min(CHUNK, len(stamp)), len(array.channels), len(start.x))
-    return sum(keeper.trace(stamp[i:i + CHUNK], readings[i:i + CHUNK], np.empty((0, len(start.x))), trace,
-                           adaptive=False)
+    return sum(keeper.trace(stamp[i:i + CHUNK], readings[i:i + CHUNK],
+                            np.empty((0, len(start.x))), trace)
                for i in range(0, len(stamp), CHUNK))
 
 

@@ -176,7 +176,7 @@ def linearise(channels, at, work):
     """Put the rows of all channels, linearised at a state ``at`` (N,), and what they expect there
     into the Workspace."""
     for c in range(len(channels)):
-        work.count[c], work.expected[c] = channel_row(channels[c], c, at, work.index[c],
+        work.entries[c], work.expected[c] = channel_row(channels[c], c, at, work.touched[c],
                                                       work.row[c], work.scratch)
 
 
@@ -211,7 +211,7 @@ def update(state, p, channels, reading, at, work, trace, n):
         if not work.use[c]:
             flags |= unused_flags(reading[c], False)
             continue
-        count, index, row = work.count[c], work.index[c], work.row[c]
+        count, index, row = work.entries[c], work.touched[c], work.row[c]
         innovation = innovation_of(reading[c], work.expected[c], count, index, row, state.x, at)
         total = scalar_update(state.x, state.cov, index, row, count, innovation,
                               noisiness * noise_variance(channels[c], p) + work.doubt[c],

@@ -26,11 +26,9 @@ class RangeLimits:
         self._ranges = np.full((number, 3), np.nan)
         channels = array.channels[np.isfinite(array.channels["range"])]
         self._ranges.reshape(-1)[channels["column"]] = channels["range"]
-        self._floors = np.full(number, _ACC_FLOOR)
-        self._floors[array.accelerometers:] = _GYRO_FLOOR
+        self._accelerometers = array.accelerometers
         self.found = np.zeros(number, FLAT_TOPS)
         _start(self.found, self._ranges)
-        self.found["tolerance"] = LIMIT_TOLERANCE
 
     def mark(self, readings: np.ndarray) -> np.ndarray:
         """Readings (n, 3 K) of all sensors, with inf for those at a limit.
@@ -39,7 +37,7 @@ class RangeLimits:
         in a row is left out even before: no noise is so quiet, and the others fill in.
         """
         marked = readings.copy()
-        _mark(self.found, self._ranges, self._floors, marked.reshape(len(readings), -1, 3))
+        _mark(self.found, self._ranges, self._accelerometers, marked.reshape(len(readings), -1, 3))
         return marked
 
     @property
@@ -51,24 +49,26 @@ class RangeLimits:
 @njit
 def _start(found, ranges):
     for k in range(len(found)):
-        start_flat_tops(found[k], ranges[k])
+        start_flat_tops(found[k], ranges[k], LIMIT_TOLERANCE)
 
 
 @njit
-def _mark(found, ranges, floors, readings):
-    """Set what is at a limit to inf, in place: readings (n, K, 3)."""
+def _mark(found, ranges, accelerometers, readings):
+    """Set what is at a limit to inf, in place: readings (n, K, 3), gyroscopes last."""
     sample, last = np.empty(3), np.empty(3)
     for n in range(len(readings)):
         for k in range(len(found)):
+            felt = k < accelerometers
+            floor = _ACC_FLOOR if felt else _GYRO_FLOOR
             for i in range(3):
                 value = readings[n, k, i]
                 # An axis that is not measured, or has no value, is at no limit.
                 sample[i] = value if np.isfinite(value) else 0.0
                 last[i] = found[k].last[i]
-            clipped = find_flat_tops(found[k], ranges[k], floors[k], sample)
+            clipped = find_flat_tops(found[k], ranges[k], floor, felt, sample)
             for i in range(3):
                 size = abs(sample[i])
-                stands = (sample[i] == last[i] and size > floors[k] and np.isnan(ranges[k, i])
+                stands = (sample[i] == last[i] and size > floor and np.isnan(ranges[k, i])
                           and size >= found[k].largest[i])
                 if clipped >> i & 1 or stands:
                     readings[n, k, i] = np.inf

@@ -1,14 +1,14 @@
 """The causal filter of the rigid-body model: an extended Kalman filter."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION, adapt
+from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION, GRACE, adapt
 from imu_fusion.estimation.acceleration_field.cross_check import (
     CHECK,
     cross_check,
+    doubt_second_order,
     make_workspace,
 )
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
@@ -54,6 +54,7 @@ def _predict_to(stamp, state, p, channels, step, trace, n):
         dt = (stamp - state.last[0]) * 1e-9
         if dt > p.gap.max:
             flags = GAP
+            state.adaptation[0].grace = GRACE
             reopen(state.x, state.cov, dt, p.spread)
             trace.phi[n] = 0.0
             trace.dt[n] = -dt
@@ -75,6 +76,20 @@ def _fold(state):
 
 
 @njit
+def _correct(state, p, channels, reading, at, is_predicted, work, trace, n):
+    """Correct the State by a sample, linearised at the state ``at`` (N,), which may be that
+    predicted, in place; the other arguments and what is returned are those of :func:`update`."""
+    linearise(channels, at, work)
+    cross_check(state, p, channels, reading, at, work)
+    if is_predicted:
+        doubt_second_order(state, channels, work)
+    found = update(state, p, channels, reading, at, work, trace, n)
+    if found.used > 0 and p.is_adaptive:
+        adapt(state.adaptation[0], found.squares, found.used, work.innovation, state.innovation)
+    return found
+
+
+@njit
 def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
     """Filter n samples in order, in place; one of ``rows`` (n,) ROW each.
 
@@ -88,12 +103,7 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
     for n in range(len(stamp)):
         flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
         at[:] = state.x
-        linearise(channels, at, work)
-        cross_check(state, p, channels, readings[n], at, work)
-        found = update(state, p, channels, readings[n], at, work, trace, only)
-        if found.used > 0:
-            adapt(state.adaptation[0], found.squares, found.used, work.innovation,
-                  state.innovation)
+        found = _correct(state, p, channels, readings[n], at, True, work, trace, only)
         _fold(state)
         flags |= found.flags
         residual = math.nan
@@ -111,11 +121,11 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
 
 
 @njit
-def trace_samples(state, par, channels, stamp, readings, at, trace, work, adaptive):
+def trace_samples(state, par, channels, stamp, readings, at, trace, work):
     """As :func:`filter_samples`, but for the smoother: keeps a Trace of all n samples.
 
-    at: (n, N) states to linearise at, or (0, N): at each prediction; adaptive: bool, whether
-    noise and motion may become larger. Returns the log likelihood of the readings.
+    at: (n, N) states to linearise at, or (0, N): at each prediction. Returns the log likelihood of
+    the readings.
     """
     p = par[0]
     step = _make_step()
@@ -123,14 +133,10 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work, adapti
     likelihood = 0.0
     for n in range(len(stamp)):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
-        where[:] = at[n] if len(at) > 0 else state.x
-        linearise(channels, where, work)
-        cross_check(state, p, channels, readings[n], where, work)
-        found = update(state, p, channels, readings[n], where, work, trace, n)
-        likelihood += found.log_likelihood
-        if adaptive and found.used > 0:
-            adapt(state.adaptation[0], found.squares, found.used, work.innovation,
-                  state.innovation)
+        predicted = len(at) == 0
+        where[:] = state.x if predicted else at[n]
+        likelihood += _correct(state, p, channels, readings[n], where, predicted, work, trace,
+                               n).log_likelihood
         trace.x[n] = state.x
         trace.cov[n] = state.cov
         _fold(state)
@@ -138,10 +144,15 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work, adapti
 
 
 class RigidBodyFilter:
-    """The filter with its memory: a start, then samples in order."""
+    """The filter with its memory: a start, then samples in order.
 
-    def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start):
+    is_adaptive: whether noise and motion may be taken to be larger, see :mod:`.adaptation`.
+    """
+
+    def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start,
+                 is_adaptive: bool = True):
         self._par = kernel_params(params, array)
+        self._par["is_adaptive"] = is_adaptive
         self._channels = array.channels
         self._one = make_trace(1, len(array.channels), len(start.x))
         self._work = make_workspace(array.channels)
@@ -149,12 +160,13 @@ class RigidBodyFilter:
         self.state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
                            np.array([-1], dtype=np.int64), np.zeros(array.accelerometers, CHECK),
                            np.zeros(1, ADAPTATION), np.zeros(len(array.channels)))
+        self.state.adaptation["grace"] = GRACE
 
-    def get_state(self) -> NamedTuple:
+    def get_state(self) -> State:
         """A copy of the memory, for :meth:`set_state`."""
         return State(*(member.copy() for member in self.state))
 
-    def set_state(self, state: NamedTuple) -> None:
+    def set_state(self, state: State) -> None:
         """Go on from where :meth:`get_state` was called."""
         self.state = State(*(member.copy() for member in state))
 
@@ -168,10 +180,10 @@ class RigidBodyFilter:
     @property
     def touched(self) -> np.ndarray:
         """(m, TOUCHED) int, which states the entries of the channels' rows belong to."""
-        return self._work.index
+        return self._work.touched
 
     def trace(self, stamp: np.ndarray, readings: np.ndarray, at: np.ndarray,
-              trace: Trace, adaptive: bool = True) -> float:
+              trace: Trace) -> float:
         """:func:`trace_samples` with this filter's memory."""
         return trace_samples(self.state, self._par, self._channels, stamp, readings, at, trace,
-                             self._work, adaptive)
+                             self._work)

@@ -61,9 +61,9 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
     """Smooth the n samples of a Trace, from the last to the first. It inverts nothing, so
     constant biases and exact starts need no care.
 
-    touched: (m, TOUCHED) states of the channels' rows. adjoint: :class:`Adjoint`, carries on from the samples after these and ends before these.
-    smoothed: (n, N); its theta is relative to the predicted attitude. smoothed_cov:
-    (n, 18, 18).
+    touched: (m, TOUCHED) states of the channels' rows. adjoint: :class:`Adjoint`, carries on from
+    the samples after these and ends before these. smoothed: (n, N); its theta is relative to the
+    predicted attitude. smoothed_cov: (n, 18, 18).
     """
     p = par[0]
     vector, information = adjoint.vector, adjoint.information

@@ -28,8 +28,9 @@ _TURNINGS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0
 #: One measured axis. ``direction`` (3,) unit vector in body axes; ``lever`` (3,) m from the
 #: reference point; ``density``, ``range``, ``bias_sd``, ``bias_walk`` in units of the sensor;
 #: ``position_sd`` m and ``axes_sd`` rad of its mounting; ``turn`` and ``shift``, the first of the
-#: three states of the error of its axes and of its position, negative if there are none; ``column`` where it stands in a flattened reading, ``sensor`` the number of its
-#: accelerometer (the gyroscope comes last).
+#: three states of the error of its axes and of its position, negative if there are none; ``column``
+#: where it stands in a flattened reading, ``sensor`` the number of its accelerometer (the gyroscope
+#: comes last).
 CHANNEL = np.dtype([
     ("direction", "f8", 3), ("lever", "f8", 3), ("density", "f8"), ("range", "f8"),
     ("bias_sd", "f8"), ("bias_walk", "f8"), ("position_sd", "f8"), ("axes_sd", "f8"),

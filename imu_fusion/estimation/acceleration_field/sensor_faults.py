@@ -108,8 +108,8 @@ def _mounting(name, own, shift, turn):
             f"correct accelerometers.{name}.position, or raise position_sd")
     if np.any(np.abs(turn) > _BEYOND * own["axes_sd"][0]):
         remarks.append(
-            f"accelerometer '{name}' seems to be turned by {_vector(np.degrees(turn), 1)} deg about "
-            f"the body's axes: correct accelerometers.{name}.axes, or raise axes_sd")
+            f"accelerometer '{name}' seems to be turned by {_vector(np.degrees(turn), 1)} deg "
+            f"about the body's axes: correct accelerometers.{name}.axes, or raise axes_sd")
     return remarks
 
 

@@ -101,7 +101,7 @@ def test_gradient_worked_by_hand():
 def _some_axes(positions, measured, axes=None):
     axes = [np.eye(3)] * len(positions) if axes is None else axes
     return [AccelerometerParams(position=tuple(p), axes=tuple(np.ravel(a)), measured_axes=m,
-                                noise_density=1e-6, bias_sd=0.0)
+                                noise_density=1e-6, bias_sd=0.0, position_sd=0.0, axes_sd=0.0)
             for p, m, a in zip(positions, measured, axes)]
 
 
@@ -124,7 +124,7 @@ def _layouts():
         "six bi-axial": _some_axes(spread[:6], [("x", "y"), ("y", "z"), ("x", "z")] * 2, turned),
         "twelve uni-axial": _some_axes(spread, [("x",)] * 12, turned),
         "nine-accelerometer package": _nine_accelerometer_package(
-            0.1, noise_density=1e-6, bias_sd=0.0),
+            0.1, noise_density=1e-6, bias_sd=0.0, position_sd=0.0, axes_sd=0.0),
     }
 
 

@@ -1,0 +1,325 @@
+"""Where the data are not as the model thinks: errors, what is stated of them, and what is said.
+
+    python -m benchmarks.misfits [PART or SITUATION ...]
+
+Every row is a situation with known truth, simulated with 20 seeds. Ends with 1 if an estimate is off
+by more than three stated standard deviations, in the mean over a run, and nothing was said.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.table import write_table
+from imu_fusion.errors import LayoutError
+from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
+from imu_fusion.estimation.acceleration_field.params import (
+    AccelerationFieldParams,
+    AccelerometerParams,
+    Initial,
+)
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+from imu_fusion.samples.checks import check_frames
+from imu_fusion.samples.logs import ImuLog, MagLog
+from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS
+from imu_fusion.simulation.rigid_body_impact import simulate as simulate_impact
+from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.streams.orientation import IMU_TOPIC, MAG_TOPIC, findings
+
+SEEDS = 20
+#: Mean normalised error squared, three degrees of freedom, of an error of three sigma.
+LIMIT = 9.0
+
+
+@dataclass
+class Outcome:
+    """What one run gave: ``error`` and ``sd`` in ``unit``, root mean squares; ``nees`` mean of that
+    quantity which fits worst; ``share`` of its components within 3 sigma; ``said``: texts;
+    ``refused``: whether there is no estimate without --force."""
+
+    error: float = np.nan
+    sd: float = np.nan
+    unit: str = ""
+    nees: float = np.nan
+    share: float = np.nan
+    said: list[str] = field(default_factory=list)
+    refused: bool = False
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A row: ``run(seed)`` gives its Outcome; ``before`` is what it was, in words."""
+
+    part: str
+    situation: str
+    before: str
+    run: Callable[[int], Outcome]
+
+
+def row(scenario: Scenario) -> tuple[list[str], int]:
+    """Cells of a Scenario, and how many of its runs were wrong without a word."""
+    runs = [scenario.run(seed) for seed in range(SEEDS)]
+    said = Counter(text for run in runs for text in dict.fromkeys(_kind(t) for t in run.said))
+    silent = sum(run.nees > LIMIT and not run.said for run in runs)
+
+    def mean(name):
+        values = [getattr(run, name) for run in runs if np.isfinite(getattr(run, name))]
+        return f"{np.mean(values):.3g}" if values else ""
+
+    unit = runs[0].unit
+    words = "; ".join(f"{text} ({count} of {SEEDS})" for text, count in said.most_common(2))
+    if any(run.refused for run in runs):
+        words = f"refused in {sum(run.refused for run in runs)} of {SEEDS}: " + words
+    return [scenario.part, scenario.situation, scenario.before,
+            *(f"{mean(name)} {unit}" if mean(name) else "" for name in ("error", "sd")),
+            mean("share"), mean("nees"), words or "nothing"], silent
+
+
+def _kind(text):
+    """A remark without its numbers and names, and not all of it."""
+    words = text.split(": ", 1)[-1] if text.startswith(("imu", "gyroscope:")) else text
+    return "".join("#" if letter.isdigit() else letter for letter in words)[:110].replace("|", "/")
+
+
+# -- Acceleration field ------------------------------------------------------------------------
+
+CENTRE = np.array([0.0, 0.0, 0.75])
+PLACES = PAPER_POSITIONS - CENTRE
+NAMES = ("top", "left", "front", "back")
+NOISE, BIAS = 0.3, 0.1    # m/s^2
+FIELD = AccelerationFieldParams(initial=Initial(
+    mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=0.05,
+    orientation_sd=0.002), gravity=9.8)
+MOTION = simulate_impact(duration=1.0)
+
+
+def layout(**changes) -> dict[str, AccelerometerParams]:
+    """The four accelerometers of the paper about the centre of its ellipsoid."""
+    return {name: AccelerometerParams(
+        position=tuple(place), axes=tuple(axes.ravel()), bias_sd=BIAS,
+        noise_density=NOISE / 1000 ** 0.5, **changes)
+        for name, place, axes in zip(NAMES, PLACES, PAPER_AXES)}
+
+
+def felt(rng, position_sd=0.0, axes_sd=0.0, places=PLACES, jitter=0.0) -> np.ndarray:
+    """Readings (n, 4, 3) of the paper's impact."""
+    places = places + CENTRE + position_sd * rng.standard_normal(places.shape)
+    axes = np.array([a @ Rotation.from_rotvec(axes_sd * rng.standard_normal(3)).as_matrix().T
+                     for a in PAPER_AXES])
+    clean = MOTION.readings(places, axes)
+    if jitter:
+        t = MOTION.t
+        for k in range(len(places)):
+            at = np.clip(t + rng.normal(0.0, jitter, len(t)), 0.0, t[-1])
+            clean[:, k] = np.column_stack([np.interp(at, t, clean[:, k, i]) for i in range(3)])
+    return (clean + rng.normal(0.0, BIAS, (1, *clean.shape[1:]))
+            + rng.normal(0.0, NOISE, clean.shape))
+
+
+def field_outcome(readings, accelerometers, params=FIELD) -> Outcome:
+    """Outcome of one recording of the impact."""
+    estimator = AccelerationFieldEstimator(params, accelerometers)
+    rows = estimator.run(MOTION.stamp, readings)
+    force = MOTION.specific_force_body(CENTRE)
+    errors = {
+        "omega": MOTION.omega - rows["omega"], "specific_force": force - rows["specific_force"],
+        "attitude": (Rotation.from_quat(rows["quat"]).inv()
+                     * Rotation.from_quat(MOTION.quat)).as_rotvec()}
+    nees, shares = [], []
+    for name, error in errors.items():
+        cov = rows["cov_" + name] + 1e-15 * np.eye(3)
+        nees.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)))
+        shares.append(np.mean(np.abs(error) <= 3 * np.sqrt(np.einsum("nii->ni", cov))))
+    size = np.linalg.norm(force)
+    sd = np.sqrt(np.sum(np.trace(rows["cov_specific_force"], axis1=1, axis2=2)))
+    return Outcome(100 * np.linalg.norm(errors["specific_force"]) / size, 100 * sd / size, "%",
+                   max(nees), min(shares), estimator.remarks())
+
+
+def field_row(situation, before, readings, changes=None, **params) -> Scenario:
+    """Scenario of readings(rng) -> (n, 4, 3)."""
+    def run(seed):
+        return field_outcome(readings(np.random.default_rng(seed)), layout(**(changes or {})),
+                             FIELD.replace(**params))
+    return Scenario("Acceleration field", situation, before, run)
+
+
+def dies(rng):
+    readings = felt(rng)
+    readings[300:, 1] = 0.0
+    return readings
+
+
+def reversed_one(rng):
+    readings = felt(rng)
+    readings[:, 0] *= -1.0
+    return readings
+
+
+def exchanged(rng):
+    readings = felt(rng)
+    readings[:, [0, 1]] = readings[:, [1, 0]]
+    return readings
+
+
+def misplaced(rng):
+    places = PLACES.copy()
+    places[2] += [-0.05, 0.03, 0.02]
+    return felt(rng, places=places)
+
+
+def six_uniaxial(seed):
+    rng = np.random.default_rng(seed)
+    places, axes = rng.uniform(-0.1, 0.1, (6, 3)), Rotation.random(6, random_state=seed)
+    try:
+        AccelerationFieldEstimator(FIELD, [
+            AccelerometerParams(position=tuple(place), axes=tuple(axis.ravel()),
+                                measured_axes=("x",))
+            for place, axis in zip(places, axes.as_matrix())])
+    except LayoutError as error:
+        return Outcome(said=[str(error)], refused=True)
+    return Outcome(nees=np.inf)
+
+
+FIELD_ROWS = [
+    field_row("clean, mounting known exactly (sd 0)", "", felt,
+              {"position_sd": 0.0, "axes_sd": 0.0}),
+    field_row("clean, defaults", "", felt),
+    field_row("clean, defaults, smoothed", "", felt, mode="smoothed"),
+    field_row("positions off by 1 mm", "NEES 4,600", lambda rng: felt(rng, position_sd=1e-3)),
+    field_row("axes off by 2 deg", "NEES 29,000", lambda rng: felt(rng, axes_sd=0.035)),
+    field_row("both", "", lambda rng: felt(rng, position_sd=1e-3, axes_sd=0.035)),
+    field_row("both, smoothed", "", lambda rng: felt(rng, position_sd=1e-3, axes_sd=0.035),
+              mode="smoothed"),
+    field_row("one of four dies", "3,406 %, silent", dies),
+    field_row("one of four reversed", "peak -29 %, silent", reversed_one),
+    field_row("one of four 62 mm from its place", "HIC15 +56 %, silent", misplaced),
+    field_row("two of four exchanged", "silent", exchanged),
+    Scenario("Acceleration field", "six uni-axial accelerometers", "2,600 %", six_uniaxial),
+    field_row("clipped at 20 m/s^2, no range given", "NEES 4e5",
+              lambda rng: np.clip(felt(rng), -20.0, 20.0)),
+    field_row("clipped at 80 m/s^2, no range given", "", lambda rng: np.clip(felt(rng), -80, 80)),
+    field_row("clipped at 78.4532, range: 78.453", "detection off",
+              lambda rng: np.clip(felt(rng), -78.4532, 78.4532), {"range": (78.4533,)}),
+    field_row("jitter of 2 ms that no stamp tells", "NEES 190",
+              lambda rng: felt(rng, jitter=2e-3)),
+]
+
+
+# -- Orientation's inputs ----------------------------------------------------------------------
+
+REAL = Sensors(gyr_density=2e-4, acc_density=2e-3, mag_sd=3e-7, gyr_bias=(0.01, -0.02, 0.005))
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+AK8963 = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def input_row(situation, before, spoil, with_mag=True) -> Scenario:
+    """Scenario of logs that spoil(imu, mag, rng) -> (imu, mag) has spoilt."""
+    def run(seed):
+        imu, mag, truth, _ = simulate(Tumbling(seed=seed), 25.0, rate=100.0, sensors=REAL,
+                                      seed=seed)
+        imu, mag = spoil(imu, mag if with_mag else mag[:0], np.random.default_rng(seed))
+        logs = {IMU_TOPIC: imu} | ({MAG_TOPIC: mag} if with_mag else {})
+        found = findings(logs)
+        rows = OrientationEstimator(OrientationParams(declination_deg=0.0)).run(imu, mag)
+        at = np.searchsorted(truth.stamp, rows["stamp"])
+        error = (Rotation.from_quat(rows["quat_world_imu"]).inv()
+                 * Rotation.from_quat(truth.quat_world_imu[at]))
+        if not with_mag:    # heading is arbitrary
+            up = [0.0, 0.0, 1.0]
+            angle = np.linalg.norm(
+                Rotation.from_quat(rows["quat_world_imu"]).inv().apply(up)
+                - Rotation.from_quat(truth.quat_world_imu[at]).inv().apply(up), axis=1)
+            sd = np.sqrt(np.mean(np.linalg.eigvalsh(rows["cov_attitude"])[:, :2].sum(axis=1)))
+            nees = np.mean(angle ** 2) / sd ** 2 * 3.0
+        else:
+            vector = error.as_rotvec()
+            angle = error.magnitude()
+            nees = np.mean(np.einsum("ni,nij,nj->n", vector, np.linalg.inv(
+                rows["cov_attitude"] + 1e-12 * np.eye(3)), vector))
+            sd = np.sqrt(np.mean(np.trace(rows["cov_attitude"], axis1=1, axis2=2)))
+        return Outcome(np.degrees(np.sqrt(np.mean(angle ** 2))), np.degrees(sd), "deg", nees,
+                       np.mean(angle <= 3.0 * sd), [f.text for f in found],
+                       any(f.unusable for f in found))
+    return Scenario("Orientation's inputs", situation, before, run)
+
+
+def with_imu(imu, gyr=None, acc=None):
+    return ImuLog(imu.stamp, imu.gyr if gyr is None else gyr, imu.acc if acc is None else acc,
+                  imu.frame_id)
+
+
+def half_filled(imu, mag, rng):
+    first = (np.arange(len(imu)) % 2 == 0)[:, None]
+    return with_imu(imu, imu.gyr * first, imu.acc * ~first), mag
+
+
+def one_wild_force(imu, mag, rng):
+    acc = imu.acc.copy()
+    acc[rng.integers(1000, 2000)] = 1000.0 * rng.standard_normal(3)
+    return with_imu(imu, acc=acc), mag
+
+
+def frames(seed):
+    found = check_frames({"imu_left": None, "imu_right": None}, IMU_TOPIC)
+    return Outcome(said=[f.text for f in found], refused=any(f.unusable for f in found))
+
+
+INPUT_ROWS = [
+    input_row("clean", "", lambda imu, mag, rng: (imu, mag)),
+    input_row("clean, no magnetometer", "", lambda imu, mag, rng: (imu, mag), with_mag=False),
+    input_row("rates in deg/s, no magnetometer", "133 deg, silent",
+              lambda imu, mag, rng: (with_imu(imu, np.degrees(imu.gyr)), mag), with_mag=False),
+    input_row("gyroscope a quarter turn from the accelerometer", "48 deg, stated 1",
+              lambda imu, mag, rng: (with_imu(imu, imu.gyr @ QUARTER.T), mag), with_mag=False),
+    input_row("rate exactly zero", "silent",
+              lambda imu, mag, rng: (with_imu(imu, 0.0 * imu.gyr), mag)),
+    input_row("alternate half-filled messages", "silent", half_filled),
+    input_row("magnetometer a quarter turn off", "87 deg, stated 5",
+              lambda imu, mag, rng: (imu, MagLog(mag.stamp, mag.mag @ QUARTER.T))),
+    input_row("magnetometer in the axes of an AK8963", "34 deg",
+              lambda imu, mag, rng: (imu, MagLog(mag.stamp, mag.mag @ AK8963.T))),
+    input_row("magnetometer constant while turning", "silent",
+              lambda imu, mag, rng: (imu, MagLog(mag.stamp, 0.0 * mag.mag + mag.mag[0]))),
+    input_row("hard iron twice the field", "",
+              lambda imu, mag, rng: (imu, MagLog(mag.stamp, mag.mag + [60e-6, -50e-6, 60e-6]))),
+    input_row("specific force reversed, no magnetometer", "silent",
+              lambda imu, mag, rng: (with_imu(imu, acc=-imu.acc), mag), with_mag=False),
+    input_row("one wild force of 1000 m/s^2", "", one_wild_force),
+    Scenario("Orientation's inputs", "two frames on one topic", "silent", frames),
+]
+
+#: All rows, in order; whoever has more adds them here.
+SCENARIOS: list[Scenario] = [*FIELD_ROWS, *INPUT_ROWS]
+
+
+def main(wanted: Sequence[str]) -> int:
+    """Write the table; of some rows alone, print it only in part."""
+    rows, silent = [], []
+    for scenario in SCENARIOS:
+        if wanted and not any(word in (scenario.part, scenario.situation) for word in wanted):
+            continue
+        cells, wrong = row(scenario)
+        rows.append(cells)
+        print(" | ".join(cells), flush=True)
+        if wrong:
+            silent.append(f"{scenario.situation}: wrong without a word in {wrong} of {SEEDS} runs")
+    header = ["part", "situation", "before", "error", "stated sd", "within 3 sigma", "NEES", "said"]
+    if not wanted:
+        write_table("misfits", header, rows, (
+            f"Means over {SEEDS} runs each, of the estimate with --force where it is refused. Error "
+            "and stated sd of the specific force at the centre of the paper's impact, in percent of "
+            "it, and of the orientation; share and NEES (three degrees of freedom) of the quantity "
+            "that fits worst. " + ("Wrong without a word: " + "; ".join(silent) if silent
+                                   else "No row is wrong without a word.")))
+    for text in silent:
+        print(text)
+    return 1 if silent else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
