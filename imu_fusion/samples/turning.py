@@ -21,8 +21,9 @@ _STEP = 0.01            # s of the integration
 _MOST = 60              # windows that are looked at
 _FEWEST = 3             # windows that prove anything
 _TURNED = 0.5           # rad by which the direction must turn within a window
-_BETTER = 0.3           # of the spread: what the right hypothesis leaves of it
-_SHARE = 0.8            # of the windows in which it is better
+_BETTER = 0.5           # of the spread: what the right hypothesis leaves of it
+_SHARE = 0.8            # of the windows in which it is better,
+_PROOF = 5.0            # by so many standard errors
 _EXPLAINED = 0.1        # of the spread is left where nothing is wrong and nothing disturbs
 _GRAVITY = 9.81
 _LEAST_TURN = 0.26      # rad: frames that differ by less are a matter of calibration
@@ -208,7 +209,11 @@ def field_verdict(imu: ImuLog, mag: MagLog) -> Verdict:
 
 
 def _is_better(best, recorded):
-    return (best.sum() < _BETTER * recorded.sum() and np.mean(best < recorded) >= _SHARE)
+    """Whether a hypothesis leaves so much less of the spread (w,), window by window, that neither
+    accelerations nor the choice among many explain it."""
+    gain = np.log(recorded) - np.log(best)
+    proof = gain.mean() * np.sqrt(len(gain)) / max(float(gain.std()), 0.1)
+    return best.sum() < _BETTER * recorded.sum() and proof > _PROOF and np.mean(gain > 0) >= _SHARE
 
 
 def _best_rotation(spread_of, axes):

@@ -32,7 +32,7 @@ from imu_fusion.estimation.acceleration_field.rows import ROW, put_still_rows
 from imu_fusion.estimation.acceleration_field.sensor_array import make_sensor_array
 from imu_fusion.estimation.acceleration_field.sensor_faults import (
     SensorFit,
-    array_remarks,
+    fit_remarks,
     sensor_fits,
 )
 from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
@@ -93,11 +93,14 @@ class AccelerationFieldEstimator:
 
     def remarks(self) -> list[str]:
         """What is wrong with the sensors, and what to do, by the samples so far."""
-        if self.params.method != "rigid_body":
-            return []
-        found = [text for fit in self.sensor_fits() for text in fit.remarks]
+        found = []
+        mounting = self.array.felt[["position_sd", "axes_sd"]].tolist()
+        if self.params.method != "rigid_body" and np.any(mounting):
+            found.append(f"method '{self.params.method}' takes positions and axes as exact: what "
+                         "it states leaves their errors out; use rigid_body, or say that they are "
+                         "(position_sd and axes_sd 0)")
         if self._judged is not None:
-            found += array_remarks(self._judged)
+            found += fit_remarks(self.sensor_fits(), self._judged)
         unit = {"gyroscope": "rad/s"}
         for name, limits in self.limits_found.items():
             known = ", ".join(f"{limit:.6g}" for limit in limits if np.isfinite(limit))

@@ -23,7 +23,8 @@ class SensorFit:
     ``samples`` were checked, ``left_out`` of them were not used because it contradicted the others;
     ``residual`` rms in units of what noise, bias and mounting allow; ``position_error`` (3,) m and
     ``axes_error`` (3,) rad, estimates with ``_sd``, body axes; nan where there is no such state.
-    ``remarks`` say what is wrong and what to do.
+    ``fault`` says why it was left out, ``mounting`` in what its mounting is not as described, each
+    with what to do; empty where nothing is wrong.
     """
 
     name: str
@@ -34,7 +35,8 @@ class SensorFit:
     position_error_sd: np.ndarray
     axes_error: np.ndarray
     axes_error_sd: np.ndarray
-    remarks: list[str]
+    fault: str = ""
+    mounting: tuple[str, ...] = ()
 
     def numbers(self) -> dict:
         """Plain numbers for results.json."""
@@ -46,28 +48,34 @@ class SensorFit:
 
 def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[SensorFit]:
     """The SensorFits of an array after the samples that led to ``state``."""
-    found = []
+    found: list[SensorFit] = []
     for k, name in enumerate(names):
         own = array.channels[array.channels["sensor"] == k]
         check = state.checks[k]
         shift, shift_sd = _states(state, int(own["shift"][0]))
         turn, turn_sd = _states(state, int(own["turn"][0]))
         residual = np.sqrt(check["squares"] / check["channels"]) if check["channels"] else np.nan
-        remarks = []
+        fault = ""
         if check["left_out"] >= _SAMPLES:
-            remarks.append(
-                f"accelerometer '{name}' contradicts the others in {check['left_out']} of "
-                f"{check['checked']} samples and was left out of them: {_cause(name, check, own)}")
-        else:
-            remarks += _mounting(name, own, shift, turn)
-        found.append(SensorFit(name, int(check["checked"]), int(check["left_out"]),
-                               float(residual), shift, shift_sd, turn, turn_sd, remarks))
+            fault = (f"accelerometer '{name}' contradicts the others in {check['left_out']} of "
+                     f"{check['checked']} samples and was left out of them: "
+                     f"{_cause(name, check, own)}")
+        found.append(SensorFit(
+            name, int(check["checked"]), int(check["left_out"]), float(residual), shift, shift_sd,
+            turn, turn_sd, fault, () if fault else _mounting(name, own, shift, turn)))
     return found
 
 
-def array_remarks(state: State) -> list[str]:
-    """What is wrong with the sensors as a whole, and what to do."""
-    remarks = []
+def fit_remarks(fits: list[SensorFit], state: State) -> list[str]:
+    """What is wrong with the sensors, single ones and as a whole, and what to do."""
+    remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
+    moved = [fit.name for fit in fits if fit.mounting]
+    if len(moved) > len(fits) / 2:
+        # Of so many, what they have in common is more likely.
+        remarks = [fit.fault for fit in fits if fit.fault] + [
+            f"positions or axes of {len(moved)} of {len(fits)} accelerometers do not fit what is "
+            "described: check units and scale of the positions; or the motion is faster than the "
+            "sampling"]
     doubted = int(state.checks["doubted"].max())
     if doubted >= _SAMPLES:
         remarks.append(
@@ -99,7 +107,7 @@ def _states(state, first):
 
 
 def _mounting(name, own, shift, turn):
-    """Remarks on a mounting that is not as described."""
+    """Texts on a mounting that is not as described."""
     remarks = []
     # What the data do not tell stays near zero: an estimate far from it is one.
     if np.any(np.abs(shift) > _BEYOND * own["position_sd"][0]):
@@ -110,7 +118,7 @@ def _mounting(name, own, shift, turn):
         remarks.append(
             f"accelerometer '{name}' seems to be turned by {_vector(np.degrees(turn), 1)} deg "
             f"about the body's axes: correct accelerometers.{name}.axes, or raise axes_sd")
-    return remarks
+    return tuple(remarks)
 
 
 def _cause(name, check, own):
