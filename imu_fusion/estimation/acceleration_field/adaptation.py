@@ -1,8 +1,9 @@
 """What the innovations say of the noise and of the motion that the parameters describe (numba).
 
-Where they are larger than they should be, sample after sample, something is: noise, if they change
-their signs (jitter of the clock, flexing, ringing), else the motion is wilder than its densities
-(Mehra 1970). That is then taken to be larger until the innovations fit again: estimates weigh
+Where they are larger than they should be, sample after sample, something is. Noise, as far as the
+accelerometers do not agree on one rigid motion, or if innovations change their signs (Mehra 1970):
+jitter of the clock, flexing, ringing. Else the motion is wilder than its densities. That is then
+taken to be larger, by no more than was seen, until the innovations fit again: estimates weigh
 rightly what they have, and say how sure they are. Of data that fit nothing changes at all: the
 excess is summed (Page 1954), and has to be more than chance makes it.
 """
@@ -24,7 +25,7 @@ ADAPTATION = np.dtype([
 _EXPECTED = 1.5     # mean square of a channel's innovation that is no excess, in its variances
 _CHANCE = 6.0       # summed excess of twelve channels that chance makes once in many days
 _SLOWNESS = 20.0    # excess that makes a variance e times larger
-_LARGEST = 280.0    # excess beyond which nothing grows
+_ALTERNATING = -0.15   # correlation of innovations with those before, below which they are noise
 GRACE = 30          # samples after a start or a gap, in which linearisation is to blame
 _MEMORY = 0.9       # of products, from sample to sample
 
@@ -36,17 +37,27 @@ def factor(excess):
 
 
 @njit
-def _summed(total, excess, is_its):
-    """The summed excess with that of one more sample; what was large goes the faster."""
-    if excess > 0.0:
-        return min(total + excess, _LARGEST) if is_its else total
-    return max(total + excess * max(1.0, total / _SLOWNESS), 0.0)
+def _summed(total, squares):
+    """The summed excess with the mean ``squares`` of one more sample; what was large goes the
+    faster, and what comes makes the variance no larger than they are."""
+    excess = squares - _EXPECTED
+    if excess < 0.0:
+        return max(total + excess * max(1.0, total / _SLOWNESS), 0.0)
+    seen = _CHANCE + _SLOWNESS * math.log(squares * factor(total))
+    return max(total, min(total + excess, seen))
 
 
 @njit
-def adapt(adaptation, squares, used, innovation, last):
-    """Take one sample: normalised ``squares`` of the innovations of ``used`` channels; innovation
-    (m,) before any of them was used, last: (m,) that of the sample before; changed."""
+def adapt(adaptation, squares, contradiction, innovation, last):
+    """Take one sample.
+
+    Args:
+        adaptation: ADAPTATION, changed.
+        squares: mean of the squares of its innovations, in units of their variances.
+        contradiction: mean square of what no rigid motion explains, in units of the noise of the
+            parameters.
+        innovation: (m,) before any of them was used; last: (m,) that of the sample before; changed.
+    """
     product, square = 0.0, 0.0
     for c in range(len(innovation)):
         product += innovation[c] * last[c]
@@ -57,10 +68,11 @@ def adapt(adaptation, squares, used, innovation, last):
     if adaptation.grace > 0:
         adaptation.grace -= 1
         return
-    excess = squares / used - _EXPECTED
-    is_motion = adaptation.product > 0.3 * adaptation.square
-    adaptation.noise = _summed(adaptation.noise, excess, not is_motion)
-    adaptation.motion = _summed(adaptation.motion, excess, is_motion)
+    noise = min(squares, contradiction / factor(adaptation.noise))
+    if adaptation.product < _ALTERNATING * adaptation.square:
+        noise = squares
+    adaptation.noise = _summed(adaptation.noise, noise)
+    adaptation.motion = _summed(adaptation.motion, squares / max(noise, 1.0))
     for i, grown in enumerate((factor(adaptation.noise), factor(adaptation.motion))):
         adaptation.samples[i] += grown > 1.0
         adaptation.most[i] = max(adaptation.most[i], math.sqrt(grown))

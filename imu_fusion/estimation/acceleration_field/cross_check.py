@@ -38,6 +38,7 @@ CHECK = np.dtype([
 _GATE = 5.0
 _PROOF = 10.0       # samples left out that make an accelerometer faulty
 _MOST = 50.0        # beyond which evidence does not grow
+_SCALE = 1e-3       # of what it feels: no accelerometer is truer
 _SHARE = 1e-3       # of a channel's reading that must be left over for a check of it
 _FORGET = 0.1       # of a sample's evidence, by one in which a moving sensor agrees
 
@@ -172,6 +173,46 @@ def cross_check(state, p, channels, reading, at, work):
 
 
 @njit
+def open_motion(state, p, channels, work, dt):
+    """Where all accelerometers agree that a or alpha has changed by more than the prediction
+    allows, as when a hard impact begins, let them: else the filter would blame biases and mounting.
+    The covariance of the State is changed; dt: s since the sample before."""
+    fit = work.fit
+    if fit.redundancy[0] < 0:
+        return
+    for i in range(6):
+        change, allowed = 0.0, 0.0
+        for c in range(len(work.innovation)):
+            change += fit.solve[i, c] * work.innovation[c]
+            # Of the noise alone: what mounting does may as well be let go with the motion.
+            allowed += (fit.solve[i, c] * fit.solve[i, c]
+                        * noise_variance(channels[c], p))
+        at, unit = (ACC + i, 1.0) if i < 3 else (ALPHA + i - 3, p.radius)
+        if change * change > _GATE * _GATE * (allowed + unit * unit * state.cov[at, at]):
+            jump = change * change / (unit * unit)
+            state.cov[at, at] += jump
+            if i >= 3:
+                # At any time of the step: so much of it is in the angular velocity.
+                omega = OMEGA + i - 3
+                state.cov[omega, omega] += dt * dt / 3.0 * jump
+                state.cov[omega, at] += 0.5 * dt * jump
+                state.cov[at, omega] += 0.5 * dt * jump
+
+
+@njit
+def contradiction(p, channels, work):
+    """Mean square of what the fit of a sample leaves over, in units of noise; 1 if it can leave
+    nothing."""
+    if work.fit.redundancy[0] <= 0:
+        return 1.0
+    squares = 0.0
+    for c in range(len(channels)):
+        if work.fit.used[c]:
+            squares += work.left[c] * work.left[c] / noise_variance(channels[c], p)
+    return squares / work.fit.redundancy[0]
+
+
+@njit
 def doubt_second_order(state, channels, work):
     """Add to ``work.doubt`` products of two errors, which no linearisation sees: of the mounting
     and of what it multiplies, and of the angular velocity with itself. They count at the start and
@@ -234,7 +275,8 @@ def _allow(state, p, channels, reading, work):
         turning += alpha * alpha
     for c in range(len(channels)):
         channel = channels[c]
-        work.variance[c] += (channel.axes_sd * channel.axes_sd * 3.0 * squares / count
+        work.variance[c] += ((channel.axes_sd * channel.axes_sd + _SCALE * _SCALE)
+                             * 3.0 * squares / count
                              + channel.position_sd * channel.position_sd * turning)
 
 

@@ -7,9 +7,11 @@ import numpy as np
 from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION, GRACE, adapt
 from imu_fusion.estimation.acceleration_field.cross_check import (
     CHECK,
+    contradiction,
     cross_check,
     doubt_second_order,
     make_workspace,
+    open_motion,
 )
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
@@ -81,11 +83,14 @@ def _correct(state, p, channels, reading, at, is_predicted, work, trace, n):
     predicted, in place; the other arguments and what is returned are those of :func:`update`."""
     linearise(channels, at, work)
     cross_check(state, p, channels, reading, at, work)
+    if p.is_adaptive:
+        open_motion(state, p, channels, work, max(trace.dt[n], 0.0))
     if is_predicted:
         doubt_second_order(state, channels, work)
     found = update(state, p, channels, reading, at, work, trace, n)
     if found.used > 0 and p.is_adaptive:
-        adapt(state.adaptation[0], found.squares, found.used, work.innovation, state.innovation)
+        adapt(state.adaptation[0], found.squares / found.used,
+              contradiction(p, channels, work), work.innovation, state.innovation)
     return found
 
 

@@ -128,9 +128,9 @@ class SensorArray:
         """This array with states for the mounting of the sensors that may be off."""
         channels = self.channels.copy()
         free = BIAS + len(channels)
-        for number in range(self.accelerometers + 1):
-            own = channels["sensor"] == number
-            for name, sd in (("turn", "axes_sd"), ("shift", "position_sd")):
+        for name, sd in (("turn", "axes_sd"), ("shift", "position_sd")):    # shifts last
+            for number in range(self.accelerometers + 1):
+                own = channels["sensor"] == number
                 if np.any(channels[sd][own] > 0.0):
                     channels[name][own] = free
                     free += 3

@@ -112,12 +112,15 @@ def _mounting(name, own, shift, turn):
     # What the data do not tell stays near zero: an estimate far from it is one.
     if np.any(np.abs(shift) > _BEYOND * own["position_sd"][0]):
         remarks.append(
-            f"accelerometer '{name}' seems to sit {_vector(1e3 * shift, 1)} mm from its position: "
-            f"correct accelerometers.{name}.position, or raise position_sd")
+            f"accelerometer '{name}' fits best {_vector(1e3 * shift, 1)} mm from its position: "
+            f"correct accelerometers.{name}.position, or raise position_sd; or its noise_density "
+            "or the densities of motion are too small for this motion, and so is what is stated")
     if np.any(np.abs(turn) > _BEYOND * own["axes_sd"][0]):
         remarks.append(
-            f"accelerometer '{name}' seems to be turned by {_vector(np.degrees(turn), 1)} deg "
-            f"about the body's axes: correct accelerometers.{name}.axes, or raise axes_sd")
+            f"accelerometer '{name}' fits best turned by {_vector(np.degrees(turn), 1)} deg about "
+            f"the body's axes: correct accelerometers.{name}.axes, or raise axes_sd; or its "
+            "noise_density or the densities of motion are too small for this motion, and so is "
+            "what is stated")
     return tuple(remarks)
 
 
