@@ -50,6 +50,16 @@ MOTION = np.dtype([
 ], align=True)
 """How much more the body moves than was said (motion_scale)."""
 
+WANDER = np.dtype([
+    ("velocity", "f8", 2),               # low-passed normalised innovations, horizontal
+    ("field", "f8"),                     # of the field, across its horizontal part
+    ("since", "f8"),                     # s since the last of the field
+    ("time", "f8"),                      # s that were judged so far
+    ("recent", "f8", 2),                 # mean squares of both: tilt, heading
+    ("overall", "f8", 2),                # the same of the whole recording
+], align=True)
+"""How far innovations are from white (wander)."""
+
 MAG_SUM = np.dtype([
     ("count", "i8"),
     ("field", "f8", 3),                  # of R m, relative to the norm
@@ -120,6 +130,7 @@ STATE = np.dtype([
     ("spike", GYRO_SPIKE),
     ("rest", REST),
     ("motion", MOTION),
+    ("wander", WANDER),
     ("counts", COUNTS),
     ("waiting_flags", "i8"),             # FLAG constants for the next row
     ("heading_known", "?"),
