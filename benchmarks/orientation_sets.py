@@ -33,6 +33,7 @@ from imu_fusion.samples.logs import ImuLog, MagLog
 # chi2 with 3 degrees of freedom, the probability of 3 sigma of a normal variate.
 _THREE_SIGMA = 14.156
 WORSE = 1.25
+_FEW = 0.9               # share within 3 sigma below which a recording is named
 _CUT = 1500              # samples after motion begins
 _JUMP = 0.25             # s, about a jump of a reference within which it does not count
 _TURN_ROWS = 20          # over which turns show how a body is mounted
@@ -266,6 +267,16 @@ def trial_line(name, scores):
         for k, s in scores.items())
 
 
+def worst(name, scores):
+    """Rows of a recording's modes that are worse than the peer, or than they say, by much."""
+    for mode, peer in (("causal", "VQF"), ("smoothed", "OfflineVQF")):
+        mine, other = scores[mode], scores[peer]
+        if mine.total > WORSE * other.total or mine.within < _FEW:
+            yield [name, mode, f"{other.total:.2f}",
+                   f"{mine.total:.2f} / {mine.inclination:.2f} / {mine.heading:.2f}",
+                   f"{mine.within:.2f}"]
+
+
 HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "ours",
           "ours / peer", "within 3 sigma", "stated / actual, inclination", "heading",
           "trials > 25 % worse"]
@@ -274,19 +285,24 @@ HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "
 def main(arguments):
     quick, trials = "--quick" in arguments, "--trials" in arguments
     chosen = [a for a in arguments if not a.startswith("--")] or list(SETS)
-    rows = []
+    rows, named = [], []
     for name in chosen:
         recordings = list(SETS[name]())[:2 if quick else None]
         scores = []
         for r in recordings:
             scores.append(peers(r) | score_ours(r))
+            named += worst(r.name, scores[-1])
             if trials:
                 print(trial_line(r.name, scores[-1]), flush=True)
         rows += summary(name, scores) if scores else []
     if quick or chosen != list(SETS):
-        for row in rows:
+        for row in rows + named:
             print(" | ".join(row))
         return
+    write_table("orientation_worst", ["recording", "mode", "peer, deg",
+                                      "ours: total / inclination / heading", "within 3 sigma"],
+                named, note=f"Recordings of orientation_sets that are {WORSE} times worse than the "
+                            f"peer, or with fewer than {_FEW} of the rows within 3 sigma.")
     write_table("orientation_sets", HEADER, rows,
                 note=f"Peers: VQF (causal) and OfflineVQF (smoothed) of vqf {version('vqf')}, "
                      "default parameters, as ours. RMSE over the rows that count, mean over the "

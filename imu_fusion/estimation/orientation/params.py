@@ -11,8 +11,9 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.parameters.record import record
 from imu_fusion.sensors.params import sensor
 
-# Before there is a sample: near iron and a poor gyroscope are the exception, one in twenty.
-_LOG_ODDS = math.log(0.05)
+# Before there is a sample: one recording in twenty is near iron; what is stated of the gyroscope is
+# given up where the samples are a thousand times likelier without it.
+_LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.05), math.log(0.001)
 # Rotation from ENU to the world frame that is published, xyzw.
 _WORLD_FRAMES = {
     "enu": (0.0, 0.0, 0.0, 1.0),
@@ -319,13 +320,14 @@ def _hypothesis(params: OrientationParams, local_field_sd: float,
                 gyro_factor: float) -> np.ndarray:
     s, f = params.sensor, params.fusion
     gyroscopes = len(f.gyro_factor) if params.method == "fusion" else 1
-    exceptions = (local_field_sd != f.local_field_sd[0]) + (gyro_factor != f.gyro_factor[0])
+    log_prior = (_LOG_ODDS_IRON * (local_field_sd != f.local_field_sd[0])
+                 + _LOG_ODDS_POOR * (gyro_factor != f.gyro_factor[0]))
     params = replace(params, sensor=replace(
         s, gyro_bias_sd=gyro_factor * s.gyro_bias_sd, gyro_scale_sd=gyro_factor * s.gyro_scale_sd))
     with_acc = params.method == "fusion"
     return record(
         params,
-        log_prior=exceptions * _LOG_ODDS,
+        log_prior=log_prior,
         gyroscopes=gyroscopes,
         local_field_sd=local_field_sd,
         gyro_factor=gyro_factor,

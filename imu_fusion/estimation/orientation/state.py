@@ -154,6 +154,8 @@ STATE = np.dtype([
     ("log_likelihood", "f8"),            # of all measurements so far, less a constant
     ("is_anchored", "?"),                # whether the heading is that of the first needle
     ("anchor", "f8", 12),                # rad, of that per hard (3) and soft iron (9)
+    ("field_scatter", "f8"),             # mean square per axis about ``field`` while moving
+    ("scattered", "i8"),                 # blocks that it is the mean of
     ("heading_var", "f8"),               # rad^2, of a heading that no filter can improve on
     # The block being collected.
     ("block", PREDICTION),
