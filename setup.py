@@ -44,7 +44,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         *tree("launch", "launch", ["*.launch.py"]),
-        *tree("config", "config", ["*.yaml"]),
+        *tree("config", "config", ["*.yaml", "*.phyphox"]),
         *tree("config/surfaces", "config/surfaces", ["*.yaml", "*.asc"]),
         *tree("bags", "bags", ["README.md"]),
         *[entry for folder in sorted(glob("bags/*/"))

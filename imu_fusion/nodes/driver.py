@@ -40,7 +40,7 @@ from imu_fusion.sources.transports.live import open_transport
 _FILE = "file://"
 _TYPES = {IMU_TOPIC: IMU, MAG_TOPIC: MAG, FIX_TOPIC: FIX, VELOCITY_TOPIC: TWIST,
           REFERENCE_TOPIC: POSE}
-_FOREIGN = 8192      # bytes without a sample, after which the format is doubted
+_FOREIGN = 4096      # bytes without a sample, after which the format is doubted
 _RATED = 20          # samples that tell the rate
 _GAP = 1.8           # usual intervals: a longer one has lost a sample
 _PLAYED = 0.01       # s of a file that are published at once

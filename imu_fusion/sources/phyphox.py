@@ -387,8 +387,9 @@ class PhyphoxLive(Source):
             time * NANOSECONDS).astype(np.int64)
         if sensor == "location":
             none = np.full(len(time), np.nan)
+            height = "zwgs84" if "zwgs84" in columns else "z"
             return locations(stamp, np.column_stack([columns.get(name, none) for name in (
-                "lat", "lon", "z", "v", "dir", "accuracy", "zAccuracy")]))
+                "lat", "lon", height, "v", "dir", "accuracy", "zAccuracy")]))
         values = np.column_stack([columns[axis] for axis in "xyz"])
         if sensor == "magnetic_field":
             return self._phone.vectors("magnetometer", stamp, values * 1e-6)

@@ -275,7 +275,7 @@ def open_transport(address: str, request: Callable[[], str | None] = lambda: Non
     """
     url = urlsplit(address)
     if url.scheme == "serial":
-        return Serial(address, url.path, _number(address, url, "baud", 115200))
+        return Serial(address, url.path, int(_number(address, url, "baud", 115200)))
     known: dict[str, Callable[[str, int], Transport]] = {
         "tcp": lambda host, port: Tcp(address, host, port),
         "udp": lambda host, port: Udp(address, host, port),
