@@ -105,6 +105,7 @@ class Smoother:
         detected = events is None and any(c.phase != "always" for c in constraints)
         if detected:
             events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
+        mag = _calibrated(mag, params)
         readings = prepare_readings({"fix": fix, "velocity": velocity, "mag": mag}, frame, params)
         measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
         around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
@@ -132,6 +133,14 @@ class Smoother:
         if best.failure:
             raise EstimationError(best.failure)
         return best
+
+
+def _calibrated(mag, params):
+    """The field as sensor.mag_offset and mag_matrix make it of a MagLog or None."""
+    if mag is None:
+        return None
+    matrix = np.reshape(params.sensor.mag_matrix, (3, 3))
+    return replace(mag, mag=(mag.mag - params.sensor.mag_offset) @ matrix.T)
 
 
 def _earlier(log, lag):
