@@ -15,6 +15,7 @@ PACKAGE = Path(imu_fusion.__file__).parent
 ARROWS = {
     "errors": (),
     "kernels": (),
+    "signals": (),
     "parameters": ("errors",),
     "geometry": ("errors", "kernels"),
     "samples": ("errors",),
@@ -27,7 +28,8 @@ ARROWS = {
     "estimation.smoother": ("errors", "kernels", "parameters", "geometry", "samples", "sensors",
                             "surfaces"),
     "evaluation": ("errors", "geometry", "samples"),
-    "messages": ("errors", "geometry", "samples", "estimation.orientation"),
+    # Rows become numbers of messages in kernels.
+    "messages": ("errors", "kernels", "geometry", "samples", "estimation.orientation"),
     "recordings": ("errors", "parameters", "samples", "messages"),
     "streams": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
                 "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
@@ -39,7 +41,7 @@ ARROWS = {
                    "estimation.acceleration_field"),
     "nodes": ("errors", "kernels", "parameters", "samples", "surfaces", "estimation.orientation",
               "estimation.acceleration_field", "estimation.smoother", "messages", "recordings",
-              "streams", "compile_ahead"),
+              "streams", "compile_ahead", "signals"),
     "batch": ("errors", "kernels", "messages", "recordings", "samples", "streams"),
     "report": ("errors", "kernels", "parameters", "geometry", "samples", "surfaces",
                "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
@@ -47,7 +49,7 @@ ARROWS = {
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
               "batch", "report"),
     "cli": ("errors", "kernels", "parameters", "recordings", "streams", "compile_ahead", "nodes",
-            "batch", "report", "demos"),
+            "batch", "report", "demos", "signals"),
 }
 # Arrows of one file, with the reason.
 ARROWS_OF_FILES = {
@@ -75,7 +77,7 @@ ROS = {"rclpy", "launch", "launch_ros", "ament_index_python", "rcl_interfaces", 
 # Imports by a name that is made at run time hide an arrow.
 HIDDEN = {"importlib", "imp", "pkgutil", "runpy"}
 HIDDEN_OF_FILES = {
-    "cli.py": {"importlib"},             # `run NODE` imports one node
+    "nodes/__init__.py": {"importlib"},  # an executable imports its own node
     "demos/__init__.py": {"importlib"},  # `demo NAME` imports one demo
     "nodes/base.py": {"importlib"},      # message classes by the names of their types
     "report/html.py": {"importlib"},     # importlib.resources

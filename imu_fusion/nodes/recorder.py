@@ -10,7 +10,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
-from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
+from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import DEPTH, NEXT, Flow, steady_timer
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.bag_writer import BagWriter
@@ -196,8 +196,3 @@ def _compile(name, pattern):
     except re.error as error:
         raise ParameterError(f"parameter '{name}' of node recorder: '{pattern}' is not a regular "
                              f"expression ({error})") from None
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run_node(Recorder, args)

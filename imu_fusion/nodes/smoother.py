@@ -5,7 +5,6 @@ import multiprocessing
 import sys
 import time
 import traceback
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from imu_fusion.errors import EstimationError, ImuFusionError, ParameterError, T
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.transforms import TF_TYPE
-from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
+from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
@@ -154,7 +153,7 @@ class SmootherNode(Node):
         # Reentrant: a second call is answered while the first one still waits.
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
-        self.create_service(Trigger, "~/clear", self._on_clear)
+        self.offer("clear", self._clear)
         self.start_diagnostics("collection", self._status)
 
     def work(self) -> float:
@@ -266,10 +265,9 @@ class SmootherNode(Node):
             self._outputs[topic].publish(cdr)
         return True
 
-    def _on_clear(self, request, response):
+    def _clear(self):
         self._stream.reset()
-        response.success, response.message = True, "the collection is empty"
-        return response
+        return "the collection is empty"
 
     def _status(self):
         stream = self._stream
@@ -284,8 +282,3 @@ class SmootherNode(Node):
         if self._result is not None or self._messages is not None:
             return DiagnosticStatus.OK, "publishing", values
         return DiagnosticStatus.OK, "collecting", values
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of the executable."""
-    return run_node(SmootherNode, args)

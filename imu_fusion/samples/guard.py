@@ -259,13 +259,13 @@ class Guard:
             stamps[place] > stamp and stamps[place] - stamps[place - 1] > _HOLE * self._usual())
 
 
-def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
-    """The usable samples of a whole log.
+def guard_log(log: AnyLog, small_jumps: bool = True) -> tuple[AnyLog, np.ndarray, Guard]:
+    """The usable samples of a whole log; ``small_jumps`` as of Guard.
 
     Returns:
         (log of what is fit for use, epochs (n,) int64 of its samples, Guard with the counts)
     """
-    guard = Guard()
+    guard = Guard(small_jumps)
     places = np.arange(len(log))[:, None].astype(np.float64)
     finite = np.isfinite(log.flat()).all(axis=1)
     judged = guard.take(log.stamp, np.where(finite[:, None], places, np.nan)).runs

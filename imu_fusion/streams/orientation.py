@@ -204,16 +204,6 @@ def turn_to_true_north(params: OrientationParams, stamp: int, sample: np.ndarray
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
-def warm_up(params: OrientationParams) -> None:
-    """Compile, or load from the cache, what the first samples would otherwise wait for."""
-    estimator = OrientationEstimator(params.replace(**{"alignment.duration": 0.05}))
-    for i in range(20):
-        stamp = i * 10_000_000
-        estimator.add_mag(stamp, np.array([0.0, 2e-5, -4e-5]))
-        estimator.add_imu(stamp, np.zeros(3), np.array([0.0, 0.0, 9.81]))
-    estimator.finish()    # with a lag: the smoother
-
-
 def _take(estimator, stamp, gyr, acc, mag_stamp, mag):
     """Samples through the estimator; returns its rows."""
     if len(stamp) + len(mag_stamp) > _FEW:
@@ -375,6 +365,16 @@ class OrientationStream(Stream):
         frame_id = self.frame_ids.get(IMU_TOPIC, "")
         return (self._writer.messages(rows, frame_id)
                 + self._writer.corrected(self.estimator.take_corrected(), frame_id))
+
+
+def warm_up(params: OrientationParams) -> None:
+    """Compile, or load from the cache, what the first samples would otherwise wait for."""
+    stream = OrientationStream(params.replace(**{"alignment.duration": 0.05}))
+    for i in range(20):
+        stamp = np.array([i * 10_000_000])
+        stream.use({MAG_TOPIC: (stamp, np.array([[0.0, 2e-5, -4e-5]])),
+                    IMU_TOPIC: (stamp, np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 9.81]]))})
+    stream.flush()    # with a lag: the smoother
 
 
 def findings(logs: Mapping[str, Any]) -> list[str]:

@@ -16,7 +16,7 @@ def _no_findings(logs: Mapping) -> list[str]:
     return []
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """One estimator, between its topics.
 
@@ -40,7 +40,7 @@ class Stage:
     inputs: Mapping[str, SampleType]
     required: tuple[str, ...]
     outputs: Mapping[str, str]
-    stream: Callable[..., Stream]
+    stream: type[Stream]
     findings: Callable[[Mapping], Sequence[str]] = _no_findings
     configure: Callable[["Stage", str | Path | None], tuple["Stage", list]] | None = None
     unusable: str = ""
@@ -54,6 +54,11 @@ class Stage:
         if self.configure is not None:
             return self.configure(self, params_file)
         return self, self.read_params(params_file)
+
+    def has_clock(self, topic: str) -> bool:
+        """Whether the clock of a topic is judged: see Guard."""
+        judged = self.stream.one_clock
+        return judged is None or topic in judged
 
     def read_params(self, params_file: str | Path | None = None) -> list:
         """The objects of ``params`` in a parameter file (or None: defaults)."""

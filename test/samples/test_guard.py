@@ -45,7 +45,8 @@ def judge(stamps, values=None, small_jumps=True):
     values = np.arange(len(stamps), dtype=float)[:, None] if values is None else values
     guard = Guard(small_jumps)
     parts = [guard.take(stamps, values), guard.finish()]
-    kept = [(int(e), (int(s) - START) / MS) for p in parts for e, stamps, _ in p.runs for s in stamps]
+    kept = [(e, (int(s) - START) / MS)
+            for p in parts for e, found, _ in p.runs for s in found]
     refused = Counter(v for p in parts for v in p.verdicts)
     assert refused == guard.counts - Counter({Verdict.OK: len(kept)})
     return kept, refused

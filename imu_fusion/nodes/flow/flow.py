@@ -71,10 +71,6 @@ class Flow:
         turn = self.sink.take()
         if self._relays:
             self.source.lost += turn.lost
-            for session in turn.over:
-                if session.late:
-                    self.peers.problem(f"joined {session.source} late: {session.late} of its "
-                                       "messages are not in what was made of them")
         return turn
 
     def finish(self, turn: Turn) -> None:

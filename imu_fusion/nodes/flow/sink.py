@@ -343,6 +343,9 @@ class Sink:
         if session.said.lost:
             self.peers.problem(f"{session.source} made its messages of incomplete data: it lacks "
                           f"at least {session.said.lost} messages")
+        if session.late:
+            self.peers.problem(f"joined {session.source} late: {session.late} of its messages had "
+                               "been sent before")
         return session.said.lost + session.late + session.broken
 
     def _compare(self, topic_input):
