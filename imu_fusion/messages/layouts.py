@@ -126,7 +126,9 @@ class Layout:
         Args:
             messages: sequence of bytes-like objects.
         """
-        stamp, frame_ids, refused = [], [], {}
+        stamp: list[int] = []
+        frame_ids: list[str] = []
+        refused: dict[int, str] = {}
         alike: dict[_Shape, tuple[list[int], list[bytes]]] = {}
         for i, cdr in enumerate(messages):
             try:

@@ -96,7 +96,8 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     Args:
         bag: recording with what the smoother needs.
         out: rosbag2 directory to write: the recording, with old estimates left out, and the
-            new ones; results.json beside them as of ``batch.process``.
+            new ones; results.json beside them as of ``batch.process``. Where a node fails there is
+            no recording, and what ``overwrite`` was to replace stays.
         params_file: ROS 2 parameter file for all nodes, or None for defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
@@ -115,7 +116,8 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     file = Path(params_file).absolute() if params_file else None
     with NodeProcesses(logs) as nodes:
         nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
-                    overwrite=overwrite, end_with_sources=True, expected_sources=(SMOOTHER,))
+                    overwrite=overwrite, whole=True, end_with_sources=True,
+                    expected_sources=(SMOOTHER,))
         for node in plan.estimators:
             own = {"smooth_at_end": True} if node == SMOOTHER else {}
             nodes.start(node, show=show and node == SMOOTHER, params_file=file, qos="reliable",

@@ -32,6 +32,9 @@ class RecorderParams(Parameters):
     chunk_size: int = param(256 * 1024, doc="size of a chunk: what a crash can lose", unit="bytes",
                             low=1024, high=2**28)
     overwrite: bool = param(False, doc="replace a recording that is there already")
+    whole: bool = param(
+        False, doc="let the recording appear when its sources have ended, or, if the recorder is "
+        "ended before, not at all")
     end_with_sources: bool = param(
         True, doc="close when all sources of recorded topics have said that they ended")
     expected_sources: tuple[str, ...] = param(
@@ -80,8 +83,8 @@ class Recorder(Node):
         self._expected = {f"/{name.lstrip('/')}" for name in p.expected_sources}
         self._sim_time = self.get_parameter("use_sim_time").value
         self._writer = BagWriter(p.out, compression=p.compression, chunk_size=p.chunk_size,
-                                 overwrite=p.overwrite)
-        self._failed = False
+                                 overwrite=p.overwrite, whole=p.whole)
+        self._is_wanted = not p.whole
         # Under use_sim_time nothing is asked for before there is a time to record it at.
         self._flow = Flow(self, on_begin=self._on_begin,
                           hold=lambda: self._sim_time and not self._now())
@@ -104,13 +107,13 @@ class Recorder(Node):
                 self._expected.discard(session.source)
         if (self._p.end_with_sources and self._has_ended and not self._expected
                 and not self._flow.sink.feeding() and not self._flow.sink.promised()):
-            self.finished = True
+            self.finished = self._is_wanted = True
         return self._flow.pause(IDLE)
 
     def close(self) -> None:
         """Close the recording and say what is in it."""
         self._flow.close()
-        if self._failed:
+        if not self._is_wanted:
             self._writer.abandon()
             return
         recorded = dict(self._writer.counts)
@@ -179,7 +182,7 @@ class Recorder(Node):
                 self._writer.write(topic, msgtype, cdr, received,
                                    info["source_timestamp"] or received)
         except BagError:
-            self._failed = True
+            self._is_wanted = False
             raise
 
 

@@ -2,9 +2,12 @@
 
 import itertools
 import multiprocessing
+import pickle
 import sys
+import tempfile
 import time
 import traceback
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,10 +57,11 @@ def _class_of(msgtype):
                              "false (imu_fusion process writes /tf without it)") from None
 
 
-def _smooth_in_child(connection, params, logs):
+def _smooth_in_child(connection, file):
     """Entry point of the child process: sends an Outcome and the number of samples, then these
     in pieces; or the reason why there are none."""
     try:
+        params, logs = pickle.loads(Path(file).read_bytes())
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smoothing.smooth(params, logs)
         samples = result.samples
@@ -80,8 +84,12 @@ class _Child:
     def __init__(self, params, logs):
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe(duplex=False)
+        # In a file: a child that is killed before it has read its arguments stalls its parent.
+        self._file = tempfile.NamedTemporaryFile(prefix="imu_fusion_")  # noqa: SIM115, see close
+        pickle.dump((params, logs), self._file)
+        self._file.flush()
         self._process = spawn.Process(target=_smooth_in_child, daemon=True,
-                                      args=(theirs, params, logs))
+                                      args=(theirs, self._file.name))
         self._process.start()
         theirs.close()
         self.samples: Any = None
@@ -115,6 +123,7 @@ class _Child:
         self._process.kill()
         self._process.join()
         self._pipe.close()
+        self._file.close()
 
 
 class SmootherNode(Node):
