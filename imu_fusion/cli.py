@@ -32,8 +32,6 @@ class _Group(click.Group):
         except ImuFusionError as error:
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
-        except Interrupted as signal:
-            ctx.exit(signal.code)
         except ModuleNotFoundError as error:
             extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
             if extra is None:
@@ -392,8 +390,11 @@ def compile() -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    with handled(interrupt):
-        cli(prog_name="imu_fusion")
+    try:
+        with handled(interrupt):
+            cli(prog_name="imu_fusion")
+    except Interrupted as signal:
+        sys.exit(signal.code)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,11 @@ from types import FrameType
 Handler = Callable[[int, FrameType | None], object]
 
 
-class Interrupted(KeyboardInterrupt):
-    """One of these signals has come. ``code``: with which the process is to end."""
+class Interrupted(BaseException):
+    """One of these signals has come. ``code``: with which the process is to end.
+
+    No KeyboardInterrupt: libraries make of that what they think right.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)

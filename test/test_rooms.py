@@ -34,7 +34,7 @@ ARROWS = {
     "streams": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
                 "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
                 "messages"),
-    "compile_ahead": ("errors", "kernels", "geometry", "samples", "surfaces",
+    "compile_ahead": ("errors", "kernels", "signals", "geometry", "samples", "surfaces",
                       "estimation.orientation", "estimation.acceleration_field",
                       "estimation.smoother", "messages", "streams"),
     "simulation": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
