@@ -7,12 +7,11 @@ import numpy as np
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
 from imu_fusion.estimation.smoother.gnss_lag import find_lag
-from imu_fusion.estimation.smoother.imu_input import prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.imu_input import first_place, prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.initial import first_attitudes
 from imu_fusion.estimation.smoother.iterated import Solution, solve
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
-from imu_fusion.estimation.smoother.measurements.gnss_fix import required
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS, prepare_readings
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.problem import Problem
@@ -99,26 +98,29 @@ class Smoother:
         """As :meth:`run`, with the stamps as they are."""
         params, surface = self.params, self.surface
         prepared = prepare_imu(imu, params)
-        fix = required(fix)
-        frame = reference_frame(surface, fix)
+        first = first_place(fix, params.initial.position)
+        fix = fix if fix is not None and fix.usable.any() else None
+        frame = reference_frame(surface, first)
         constraints = surface.constraints() if surface is not None else ()
         detected = events is None and any(c.phase != "always" for c in constraints)
         if detected:
             events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
         readings = prepare_readings({"fix": fix, "velocity": velocity, "mag": mag}, frame, params)
         measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
-        around = surroundings_of(params, frame, fix, "mag" in measured)
+        around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
         problem = Problem(prepared, params, readings, around, constraints,
                           StatePrior.of(params, measured))
         hill = surface if isinstance(surface, Hill) and events is not None else None
         best = None
-        for quat in first_attitudes(problem, mag, initial_quat)[:_STARTS]:
+        start = None if params.initial.position is None else frame.to_enu(*first)
+        for quat in first_attitudes(problem, mag, initial_quat, start)[:_STARTS]:
             result = _smooth(problem, frame, hill, quat, events)
             if result is None:
                 continue
             if best is None or result.cost[-1] < best.cost[-1]:
                 best = result
-            if result.converged and result.misfit().get("fix", np.inf) < _PLAUSIBLE:
+            judge = "fix" if "fix" in measured else "mag"
+            if result.converged and result.misfit().get(judge, 0.0) < _PLAUSIBLE:
                 break
         if best is None:
             raise EstimationError("the smoother diverged: noise far below that of the data, or "

@@ -58,6 +58,7 @@ CHANGED = {
     "jump.touchdown": (5.0, {}),
     "jump.event_margin": (0.1, {}),
     "initial.attitude_sd": (0.1, {}),
+    "initial.position": ((47.4, 10.28, 900.0), {}),
     "initial.position_sd": (2.0, {}),
     "initial.speed_sd": (1.0, {}),
     "iteration.max": (2, {}),
