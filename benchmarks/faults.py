@@ -263,7 +263,7 @@ def hostile(kind: str, trial: Trial) -> None:
                       topics=("/imu/data", *SENSORS))
     trial.nodes.start("orientation_estimator")
     trial.nodes.start("smoother")
-    trial.until(lambda: trial.out.exists())
+    trial.until(trial.out.exists)
     with trial.beside("-m", "benchmarks.hostile_peers", kind) as peer:
         peer.wait(PATIENCE)
     with trial.beside("-c", DRIVER):
