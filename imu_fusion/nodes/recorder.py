@@ -79,7 +79,7 @@ class Recorder(Node):
         self._named = {self.resolve_topic_name(topic) for topic in p.topics}
         self._regex = _compile("regex", p.regex) if p.regex is not None else None
         self._excluded = [_compile("exclude", pattern) for pattern in p.exclude]
-        self._skipped = set()
+        self._skipped, self._unclear = set(), set()
         self._expected = {f"/{name.lstrip('/')}" for name in p.expected_sources}
         self._sim_time = self.get_parameter("use_sim_time").value
         self._writer = BagWriter(p.out, compression=p.compression, chunk_size=p.chunk_size,
@@ -154,9 +154,13 @@ class Recorder(Node):
     def _subscribe(self, topic, msgtypes):
         if topic in self._inputs or topic in self._skipped or not self._selects(topic):
             return
+        if len(msgtypes) > 1:    # somebody is mistaken, and may see it
+            if topic not in self._unclear:
+                self._unclear.add(topic)
+                self.get_logger().warning(f"{topic} is not recorded while it has several types: "
+                                          + ", ".join(msgtypes))
+            return
         try:
-            if len(msgtypes) > 1:
-                raise TopicError(f"topic {topic} has several types: {', '.join(msgtypes)}")
             msgtype, = msgtypes
             cls = message_class(msgtype)
             infos = self.get_publishers_info_by_topic(topic)
