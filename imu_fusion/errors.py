@@ -46,3 +46,7 @@ class RefusedError(ImuFusionError):
 
 class EstimationError(ImuFusionError):
     """An estimator cannot produce a meaningful result from what it was given."""
+
+
+class DeviceError(ImuFusionError):
+    """A device cannot be reached, or does not answer as it should."""

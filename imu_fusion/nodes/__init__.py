@@ -27,6 +27,8 @@ class Executable(NamedTuple):
 NODES = {
     "replayer": Executable(
         "Replayer", "Play a recording on its topics.", ("pause", "resume", "step")),
+    "driver": Executable(
+        "Driver", "Samples of a device, live or from its file, on the standard topics."),
     "recorder": Executable("Recorder", "Record topics into a rosbag2 MCAP directory."),
     "orientation_estimator": Executable(
         "OrientationEstimatorNode",
