@@ -103,6 +103,7 @@ class _Cursor:
         self._cdr, self._definitions = cdr, definitions
         self._order = "<" if cdr[1] == 1 else ">"
         self._at = 4
+        self._left = len(cdr) + 1000    # fields: a definition may ask for any number of empty ones
 
     def numbers(self, kind: str, count: int) -> tuple:
         """The next values of a primitive type."""
@@ -126,8 +127,9 @@ class _Cursor:
 
     def values(self, field: _Field, depth: int = 0) -> list:
         """All numbers and texts of a field, in order."""
-        if depth > _DEEPEST:
-            raise MessageError("its definition is nested too deep")
+        self._left -= 1
+        if depth > _DEEPEST or self._left < 0:
+            raise MessageError("its definition is nested too deep, or without end")
         count = 1 if field.times is None else field.times
         if count < 0:
             count, = self.numbers("uint32", 1)
