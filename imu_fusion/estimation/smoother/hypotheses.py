@@ -1,0 +1,90 @@
+"""What else may be true of a recording whose readings contradict the model, and the evidence.
+
+Only where innovations wander or are larger than stated: each hypothesis is smoothed, and
+kept if the readings are a thousand times as likely under it. Then the noise is fitted.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.smoother.attempt import Attempt, Model
+from imu_fusion.estimation.smoother.gnss_step import find_steps
+from imu_fusion.estimation.smoother.noise_fit import fit_noise
+from imu_fusion.estimation.smoother.result import SmootherResult
+
+_GAIN = 7.0          # of the log-likelihood: odds of a thousand
+_LEFT = 0.5          # of how much fixes wander, that a step of them may leave
+_LARGE = 1.5         # standard deviations, of typical innovations of the receiver
+
+#: Groups of parameters that are zero by default, with the values that are tried: of each group the
+#: likeliest is kept, if any is likelier than none.
+_CHANGES: tuple[tuple[dict[str, Any], ...], ...] = (
+    ({"gnss.time_offset_sd": 0.2},),
+    ({"gnss.velocity_time_offset_sd": 0.2},),
+    ({"sensor.gyro_bias_walk": 1e-4, "sensor.acc_bias_walk": 3e-3},),
+    ({"gnss.position_error_sd": (1.0, 1.0, 1.5)}, {"gnss.position_error_sd": (5.0, 5.0, 7.5)}),
+    ({"gnss.velocity_error_sd": (0.3, 0.3, 0.5)},))
+
+
+def fits(result: SmootherResult) -> bool:
+    """Whether innovations are white and no larger than they should be. Smaller ones are no
+    reason: what is stated then is too cautious, and not wrong."""
+    return (all(excess == 1.0 for excess in result.wander.values())
+            and all(size < _LARGE for name, size in result.misfit().items() if name != "mag"))
+
+
+def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -> SmootherResult:
+    """The result of the likeliest model.
+
+    Args:
+        found: under ``model``. smooth: a model -> its Attempt.
+    """
+    for other in _steps(found.result, model):
+        tried = smooth(other)
+        if _gain(tried, found) > _GAIN and _left(tried.result) <= max(
+                1.0, _LEFT * _left(found.result)):
+            found, model = tried, other
+            break
+    if model.params.maximum_likelihood == "off" or fits(found.result):
+        return found.result
+    given = model.params.to_mapping()
+    for group in _CHANGES:
+        before = model.params
+        if any(np.any(before.get(name)) for name in group[0]):
+            continue
+        for changes in group:
+            found, model = _try(found, model, model.changed(changes), smooth)
+    found, model = _try(found, model, fit_noise(found.problem, model), smooth)
+    return replace(found.result, noise=dict(model.noise), adapted={
+        name: value for name, value in model.params.to_mapping().items()
+        if value != given[name]})
+
+
+def _try(found, model, other, smooth):
+    """The other model and its attempt if it is so much likelier, else those found."""
+    try:
+        tried = smooth(other)
+    except EstimationError:
+        return found, model
+    return (tried, other) if _gain(tried, found) > _GAIN else (found, model)
+
+
+def _steps(result: SmootherResult, model: Model) -> Iterator[Model]:
+    """Models with a step of the fixes, where there seems to be one."""
+    if "fix" in result.residuals:
+        for at in find_steps(result.innovations["fix"][0], result.residuals["fix"],
+                             result.wander["fix"] == 1.0):
+            yield model._replace(step_at=at)
+
+
+def _gain(tried: Attempt, found: Attempt) -> float:
+    return tried.result.log_likelihood - found.result.log_likelihood
+
+
+def _left(result: SmootherResult) -> float:
+    """How much fixes wander: all the time, where it is no step."""
+    return max(result.wander.get(name, 1.0) for name in ("fix", "moved_fix"))
