@@ -20,12 +20,12 @@ from imu_fusion.estimation.smoother.measurements.registry import (
     prepare_readings,
 )
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.problem import Problem, log_density
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.state import StatePrior
 from imu_fusion.estimation.smoother.surface_fit import (
-    at_surface,
     misfit_at_landing,
     surface_fits,
 )
@@ -54,9 +54,10 @@ class Given(NamedTuple):
 
     def earlier(self, lag: float) -> "Given":
         """With stamps of the receiver that are earlier by a lag (s)."""
-        fix, velocity = (replace(log, stamp=log.stamp - np.int64(round(lag * 1e9)))
-                         for log in (self.fix, self.velocity))
-        return self._replace(fix=fix, velocity=velocity)
+        late, fix, velocity = np.int64(round(lag * 1e9)), self.fix, self.velocity
+        return self._replace(
+            fix=None if fix is None else replace(fix, stamp=fix.stamp - late),
+            velocity=None if velocity is None else replace(velocity, stamp=velocity.stamp - late))
 
 
 class Model(NamedTuple):

@@ -1,33 +1,28 @@
 """What else may be true of a recording whose readings contradict the model, and the evidence.
 
-Only where innovations wander or are larger than stated: each hypothesis is smoothed, and
-kept if the readings are a thousand times as likely under it. Then the noise is fitted.
+Only where innovations wander or are larger than stated, and nothing else explains it: each
+hypothesis is smoothed, and kept if the readings are a thousand times as likely under it. Then the
+noise is fitted.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.attempt import Attempt, Model
 from imu_fusion.estimation.smoother.gnss_step import find_steps
+from imu_fusion.estimation.smoother.measurements.registry import KINDS
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
+from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 
-#: Groups of parameters that are zero by default, with the values that are tried: of each group the
-#: likeliest is kept, if any is likelier than none.
-_CHANGES: tuple[tuple[dict[str, Any], ...], ...] = (
-    ({"gnss.time_offset_sd": 0.2},),
-    ({"gnss.velocity_time_offset_sd": 0.2},),
-    ({"sensor.gyro_bias_walk": 1e-4, "sensor.acc_bias_walk": 3e-3},),
-    ({"gnss.position_error_sd": (1.0, 1.0, 1.5)}, {"gnss.position_error_sd": (5.0, 5.0, 7.5)}),
-    ({"gnss.velocity_error_sd": (0.3, 0.3, 0.5)},))
+_WHITE = 0.3         # of the stated noise that is left white where the rest wanders
 
 
 def fits(result: SmootherResult) -> bool:
@@ -35,6 +30,13 @@ def fits(result: SmootherResult) -> bool:
     reason: what is stated then is too cautious, and not wrong."""
     return (all(excess == 1.0 for excess in result.wander.values())
             and all(size < _LARGE for name, size in result.misfit().items() if name != "mag"))
+
+
+def other_cause(result: SmootherResult) -> bool:
+    """Whether something else is wrong: a surface that the trajectory stands off, or readings in a
+    row beside it. To fit the noise to them would hide it."""
+    return (any(fit.excess > MOST_EXCESS for fit in result.surface.values())
+            or any(is_many(outliers) for outliers in result.outliers().values()))
 
 
 def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -> SmootherResult:
@@ -49,19 +51,57 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
                 1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
-    if model.params.maximum_likelihood == "off" or fits(found.result):
+    if (model.params.maximum_likelihood == "off" or fits(found.result)
+            or other_cause(found.result)):
         return found.result
     given = model.params.to_mapping()
-    for group in _CHANGES:
-        before = model.params
-        if any(np.any(before.get(name)) for name in group[0]):
-            continue
-        for changes in group:
-            found, model = _try(found, model, model.changed(changes), smooth)
+    for alternatives in (_delays, _velocity_delays, _wandering_velocities, _wandering_fixes,
+                         _walks):
+        for other in alternatives(found, model):
+            found, model = _try(found, model, other, smooth)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
     return replace(found.result, noise=dict(model.noise), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
+
+
+def _delays(found, model):
+    return _where_zero(model, {"gnss.time_offset_sd": 0.2})
+
+
+def _velocity_delays(found, model):
+    return _where_zero(model, {"gnss.velocity_time_offset_sd": 0.2})
+
+
+def _walks(found, model):
+    return _where_zero(model, {"sensor.gyro_bias_walk": 1e-4, "sensor.acc_bias_walk": 3e-3})
+
+
+def _wandering_velocities(found, model):
+    return _wandering(found, model, "velocity", "gnss.velocity_error_sd", (1.0,))
+
+
+def _wandering_fixes(found, model):
+    return _wandering(found, model, "fix", "gnss.position_error_sd", (1.0, 3.0))
+
+
+def _wandering(found, model, name, parameter, factors):
+    """Most of what is stated of readings, or some times as much, as an error that wanders."""
+    readings = found.problem.readings
+    of_kind = readings[readings["kind"] == KINDS[name]]
+    if not len(of_kind):
+        return
+    root = np.linalg.inv(of_kind["whiten"])
+    sd = np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
+    for factor in factors:
+        for other in _where_zero(model, {parameter: tuple((factor * sd).tolist())}):
+            yield other._replace(noise={**model.noise, name: _WHITE})
+
+
+def _where_zero(model, changes):
+    """The model with other values of parameters, unless they were set."""
+    if not any(np.any(model.params.get(name)) for name in changes):
+        yield model.changed(changes)
 
 
 def _try(found, model, other, smooth):

@@ -247,8 +247,8 @@ class SmootherParams(Parameters):
         "the whole site.")
     maximum_likelihood: str = param(
         "misfit", choices=("off", "misfit"), doc="misfit: where innovations wander or are larger "
-        "than stated, delays, walks of biases, wandering errors and noise of the receiver and noise "
-        "of the Imu are fitted to the recording, and a remark names what was taken; off: never.")
+        "than stated, delays, walks of biases, wandering errors of the receiver and the noise of "
+        "all are fitted to the recording, and a remark names what was taken; off: never.")
     sensor: Sensor = Sensor()
     gap: Gap = Gap()
     gnss: Gnss = Gnss()

@@ -8,13 +8,13 @@ import numpy as np
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 
 if TYPE_CHECKING:
-    from imu_fusion.estimation.smoother.result import SmootherResult
+    from imu_fusion.estimation.smoother.result import Outliers, SmootherResult
 
 _MISFIT = 3.0
 # RMS of a single pass. Simulated jumps: 1.0 to 1.1 where the attitude is within 1 deg of the truth,
 # 1.7 where it is 6 deg off.
 _SINGLE_PASS = 1.3
-_EXCESS = 1.5                # of the deviation from a surface; see smoother_surface_fit
+MOST_EXCESS = 1.5            # of the deviation from a surface; see smoother_surface_fit
 # Simulated jumps, sunk by 0.3 m: up to 1.4; by 0.7 m, or a fall of 0.4 m: from 2.5.
 _FIRST_EXCESS = 2.0
 _LEAP_SECONDS = 18.0         # s, GPS time ahead of UTC since 2017
@@ -103,11 +103,16 @@ def _on_misfits(result):
                    f"deviations: {_ADVICE[name]}")
 
 
+def is_many(outliers: "Outliers") -> bool:
+    """Whether Outliers are more than the single ones that the loss is for."""
+    return outliers.share > _OUTLYING or outliers.longest >= _RUN
+
+
 def _on_outliers(result):
     for name, outliers in result.outliers().items():
-        if outliers.share > _OUTLYING or outliers.longest >= _RUN:
-            yield (f"{100 * outliers.share:.0f} % of the {name} readings lie beyond six standard "
-                   "deviations of the trajectory and hardly count, up to "
+        if is_many(outliers):
+            yield (f"{100 * outliers.share:.0f} % of the {name} readings lie far beside the "
+                   "trajectory and hardly count, up to "
                    f"{outliers.longest} in a row ({outliers.duration:.1f} s): {_ADVICE[name]}")
 
 
@@ -141,12 +146,12 @@ def _on_surface(result):
         if fit.silent > _SILENT:
             yield (f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of the samples "
                    "that it should hold: its grid may end there")
-        if fit.first_excess > _FIRST_EXCESS and fit.excess <= _EXCESS and result.jump:
+        if fit.first_excess > _FIRST_EXCESS and fit.excess <= MOST_EXCESS and result.jump:
             yield (f"in the first second the trajectory stands off the surface ({name}) by "
                    f"{fit.first_excess:.1f} times as much as its sigma of {fit.sigma:g} m allows: "
                    "a fall, a deep landing or another touch-down; standard deviations of the "
                    "landing are as much larger (jump.event_margin, jump.touchdown)")
-        if fit.excess > _EXCESS:
+        if fit.excess > MOST_EXCESS:
             yield (f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "
                    f"largest {fit.largest:.2f} m), over seconds {fit.excess:.1f} times as much as "
                    f"its sigma of {fit.sigma:g} m allows: the surface may be another than the one "

@@ -23,11 +23,16 @@ _GAUSSIAN_MEDIAN = 0.6745    # of |x|, x standard normal
 _OUTLIER = 6.0               # standard deviations: the default of gnss.loss_scale
 
 
+def _typical(values):
+    """Standard deviation of values, by the median: outliers do not count."""
+    return float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
+
+
 @dataclass(frozen=True)
 class Outliers:
-    """``share`` of readings that lie beyond six standard deviations of the trajectory, so that the
-    Cauchy loss lets go of them; number ``longest`` of the longest run of such, over ``duration``
-    s."""
+    """``share`` of readings that lie beyond six times what is stated of them, and what is typical
+    among them, so that the Cauchy loss lets go of them; number ``longest`` of the longest run of
+    such, over ``duration`` s."""
 
     share: float
     longest: int
@@ -36,7 +41,8 @@ class Outliers:
     @classmethod
     def of(cls, stamp: np.ndarray, residual: np.ndarray) -> "Outliers":
         """Of readings with stamps (m,) ns and residuals (m, k) in standard deviations."""
-        out = np.concatenate([[False], np.linalg.norm(residual, axis=1) > _OUTLIER, [False]])
+        limit = _OUTLIER * max(1.0, _typical(residual))
+        out = np.concatenate([[False], np.linalg.norm(residual, axis=1) > limit, [False]])
         begins, ends = np.flatnonzero(out[1:] & ~out[:-1]), np.flatnonzero(out[:-1] & ~out[1:])
         if not len(begins):
             return cls(0.0, 0, 0.0)
@@ -114,7 +120,7 @@ class SmootherResult:
     def misfit(self) -> dict[str, float]:
         """Name -> typical size of its innovations, in standard deviations: 1 where the model is
         right. By the median, so that outliers do not count."""
-        return {name: float(np.median(np.abs(values)) / _GAUSSIAN_MEDIAN)
+        return {name: _typical(values)
                 for name, (_, values) in self.innovations.items() if len(values)}
 
     def outliers(self) -> dict[str, Outliers]:

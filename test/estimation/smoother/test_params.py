@@ -46,6 +46,8 @@ CHANGED = {
     "gnss.velocity_time_offset_sd": (0.1, {}),
     "gnss.lever_arm": ((0.0, 0.1, -0.2), {}),
     "gnss.lever_arm_sd": (0.2, {}),
+    "maximum_likelihood": ("off", {"gnss.covariances": False,
+                                   "gnss.velocity_sd": (0.02, 0.02, 0.06)}),
     "mag.loss": ("squared", {}),
     "mag.loss_scale": (2.0, {}),
     "surface.body_height": (0.3, {}),
