@@ -26,6 +26,9 @@ ARROWS = {
                                       "sensors"),
     "estimation.smoother": ("errors", "kernels", "parameters", "geometry", "samples", "sensors",
                             "surfaces"),
+    # The paper's method begins with attitudes.
+    "estimation.avalanche": ("errors", "parameters", "samples", "sensors", "surfaces",
+                             "estimation.orientation"),
     "evaluation": ("errors", "geometry", "samples"),
     "messages": ("errors", "geometry", "samples", "estimation.orientation"),
     "recordings": ("errors", "parameters", "samples", "messages"),
@@ -58,7 +61,7 @@ ARROWS_OF_FILES = {
 # Below `messages` numbers are computed: no ROS, no files, no plots, no clock, no command line.
 PURE = ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
         "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
-        "evaluation")
+        "estimation.avalanche", "evaluation")
 COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime",
              "enum", "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib",
              "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}

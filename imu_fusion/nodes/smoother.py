@@ -25,11 +25,11 @@ from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
     ONCE,
-    REQUIRED,
     SmootherNodeParams,
     SmootherStream,
     SmoothingParams,
     outputs_of,
+    required_of,
 )
 from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
@@ -185,7 +185,8 @@ class SmootherNode(Node):
         played = {self._names.get(topic) for topic in session.said.topics} & INPUTS.keys()
         if played:
             self._stream.reset()
-            missing = [topic for topic in REQUIRED if topic not in played]
+            missing = [topic for topic in required_of(self._stream.params)
+                       if topic not in played]
             if missing and self._at_end:
                 raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there "
                                  "will be nothing to smooth")

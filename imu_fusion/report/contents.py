@@ -126,7 +126,7 @@ def smoothed_of(report: StageReport, origin: int) -> tuple[Smoothed | None, str 
     result, logs = report.detail
     (params,) = report.params
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoothed(result, params, surface, logs[FIX_TOPIC], logs.get(VELOCITY_TOPIC),
+    return Smoothed(result, params, surface, logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC),
                     origin), None
 
 

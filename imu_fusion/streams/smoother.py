@@ -41,7 +41,7 @@ IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
 INPUTS = {topic: SAMPLE_TYPES[layout.msgtype] for topic, layout in (
     (IMU_TOPIC, IMU), (MAG_TOPIC, MAG), (FIX_TOPIC, FIX), (VELOCITY_TOPIC, TWIST))}
-REQUIRED = (IMU_TOPIC, FIX_TOPIC)
+_REQUIRED = (IMU_TOPIC, FIX_TOPIC)
 
 ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
 SMOOTHED_FIX_TOPIC, POSE_TOPIC = "smoother/fix", "smoother/pose"
@@ -122,6 +122,11 @@ class SmootherNodeParams(EstimatorNodeParams):
                                     "takes more (docs/smoother.md).")
 
 
+def required_of(params: SmootherParams) -> tuple[str, ...]:
+    """Topics without which there is nothing to smooth: fixes are not, where the start is given."""
+    return _REQUIRED if params.initial.position is None else (IMU_TOPIC,)
+
+
 def outputs_of(params: SmoothingParams) -> dict[str, str]:
     """Topics and types of what is published under these parameters."""
     return OUTPUTS | ({TF_TOPIC: TF_TYPE} if params.publish_tf else {})
@@ -157,8 +162,8 @@ class SmootherStream(Stream):
 
     def restart(self) -> None:
         if self._merger.strict:
-            self._samples += _length(self._collected)[1]
-            self._longest = max(self._longest, self._collected, key=_length)
+            self._samples += self._length(self._collected)[1]
+            self._longest = max(self._longest, self._collected, key=self._length)
         self.dropped = 0
         self.bytes = 0
         self._collected = {topic: [] for topic in INPUTS}
@@ -197,21 +202,27 @@ class SmootherStream(Stream):
             raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
                                   f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
                                   "raise memory_limit")
-        chosen = max(self._longest, self._collected, key=_length)
+        chosen = max(self._longest, self._collected, key=self._length)
         if self._samples:
-            total = self._samples + _length(self._collected)[1]
-            self.warn(f"the clock was set: only the longest stretch, {_length(chosen)[1]} of "
+            total = self._samples + self._length(self._collected)[1]
+            self.warn(f"the clock was set: only the longest stretch, {self._length(chosen)[1]} of "
                       f"{total} Imu samples, is smoothed")
         for parts in chosen.values():
             if len(parts) > 1:    # not again at the next call
                 parts[:] = [joined(parts)]
-        missing = [topic for topic in REQUIRED if not chosen[topic]]
+        missing = [topic for topic in required_of(self.params) if not chosen[topic]]
         if missing:
             raise EstimationError(
                 f"nothing to smooth: no samples on {' and '.join(missing)}"
                 + (" since the clock was set back" if self.restarts else ""))
         return {topic: INPUTS[topic].log(*parts[0], self.frame_ids[topic])
                 for topic, parts in chosen.items() if parts}
+
+    def _length(self, stretch):
+        """Whether a collection has what is needed, and its number of Imu samples."""
+        counts = [sum(len(stamp) for stamp, _ in stretch[topic])
+                  for topic in required_of(self.params)]
+        return min(counts) > 0, counts[0]
 
     def conclude(self) -> Conclusion:
         """What the samples of a whole recording make: the smoothed trajectory; its detail is
@@ -221,12 +232,6 @@ class SmootherStream(Stream):
         outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
         return Conclusion(messages(result.samples, outcome, self.params),
                           outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
-
-
-def _length(stretch):
-    """Whether a collection has what is needed, and its number of Imu samples."""
-    counts = [sum(len(stamp) for stamp, _ in stretch[topic]) for topic in REQUIRED]
-    return min(counts) > 0, counts[0]
 
 
 def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
@@ -243,8 +248,8 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoother(params, surface).run(logs[IMU_TOPIC], logs.get(MAG_TOPIC), logs[FIX_TOPIC],
-                                         logs.get(VELOCITY_TOPIC))
+    return Smoother(params, surface).run(logs[IMU_TOPIC], logs.get(MAG_TOPIC),
+                                         logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
 
 
 @dataclass(frozen=True)
@@ -398,7 +403,9 @@ def _path(samples, stamp, world):
 
 def findings(logs: Mapping[str, Any]) -> list[str]:
     """What looks wrong with whole logs as recorded: texts."""
-    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC) + checks.check_fix(logs[FIX_TOPIC])
+    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
+    if FIX_TOPIC in logs:
+        found += checks.check_fix(logs[FIX_TOPIC])
     if MAG_TOPIC in logs:
         found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
     return [finding.text for finding in found]
@@ -408,8 +415,8 @@ def _configure(stage, params_file):
     (params,) = stage.read_params(params_file)
     if params.surface.file:
         load_surface(params.surface.file)  # a bad file is refused before anything is read
-    return replace(stage, outputs=outputs_of(params)), [params]
+    return replace(stage, required=required_of(params), outputs=outputs_of(params)), [params]
 
 
-STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, REQUIRED, OUTPUTS,
+STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, _REQUIRED, OUTPUTS,
               SmootherStream, findings, _configure)

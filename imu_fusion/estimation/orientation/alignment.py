@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
-from imu_fusion.estimation.orientation.mag_rejection import are_saturated
+from imu_fusion.estimation.orientation.mag_rejection import are_saturated, new_limit
 from imu_fusion.estimation.orientation.params import OrientationParams
-from imu_fusion.estimation.orientation.state import MAG_LIMIT
 from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
 from imu_fusion.kernels import njit
 from imu_fusion.sensors.saturation import saturated_axes
@@ -87,7 +86,7 @@ def usable_mags(mag: np.ndarray, par: np.ndarray) -> np.ndarray:
     """
     if len(mag) == 0:
         return np.zeros(0, dtype=bool)
-    found = np.zeros(1, MAG_LIMIT)
+    found = new_limit(par)
     for _ in range(2):
         usable = ~are_saturated(found, par, mag)
     norm = np.linalg.norm(mag, axis=1)

@@ -3,7 +3,13 @@
 import numpy as np
 
 from imu_fusion.kernels import njit
-from imu_fusion.sensors.saturation import FLAT_TOPS, find_flat_tops, start_flat_tops
+from imu_fusion.sensors.saturation import (
+    BAND,
+    FLAT_TOPS,
+    find_flat_tops,
+    mark_flat_tops,
+    start_flat_tops,
+)
 
 _FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
 
@@ -11,7 +17,8 @@ _FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
 @njit
 def start(found, ranges):
     """Limits that were given, (3,) rad/s; those to be found (nan) are infinite until then."""
-    start_flat_tops(found, ranges)
+    # A range from a data sheet is that before calibration.
+    start_flat_tops(found, ranges, BAND)
 
 
 @njit
@@ -26,15 +33,14 @@ def find(found, ranges, gyr):
     Returns:
         int, bits of the axes at their limit, x first.
     """
-    return find_flat_tops(found, ranges, _FLOOR, gyr)
+    return find_flat_tops(found, ranges, _FLOOR, False, gyr)
 
 
 @njit
 def _find_all(found, par, gyr):
     ranges = par[0].sensor.gyro_range
     start(found[0], ranges)
-    for i in range(len(gyr)):
-        find(found[0], ranges, gyr[i])
+    mark_flat_tops(found, ranges, _FLOOR, False, gyr)
 
 
 def limits_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:

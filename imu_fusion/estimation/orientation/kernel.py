@@ -9,7 +9,14 @@ from functools import cache
 
 import numpy as np
 
-from imu_fusion.estimation.orientation import bank, fusion, gyro_limit, gyro_mag, mag_queue
+from imu_fusion.estimation.orientation import (
+    bank,
+    fusion,
+    gyro_limit,
+    gyro_mag,
+    mag_queue,
+    mag_rejection,
+)
 from imu_fusion.estimation.orientation.alignment import Alignment
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
@@ -36,6 +43,7 @@ def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None
 def _start_limits(state, par):
     for k in range(len(state)):
         gyro_limit.start(state[k].gyro_limit, par[k].sensor.gyro_range)
+        mag_rejection.start_limit(state[k].mag_limit, par[k].sensor.mag_range)
 
 
 @njit

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from imu_fusion.estimation.orientation.mag_rejection import TOLERANCE, are_saturated
+from imu_fusion.estimation.orientation.mag_rejection import are_saturated, new_limit
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
-from imu_fusion.estimation.orientation.state import MAG_LIMIT
 
 
 class MagScreen:
@@ -13,7 +12,7 @@ class MagScreen:
 
     def __init__(self, params: OrientationParams) -> None:
         self._par = kernel_parameters(params)
-        self._found = np.zeros(1, MAG_LIMIT)
+        self._found = new_limit(self._par)
 
     def saturated(self, mag: np.ndarray) -> np.ndarray:
         """Mask (m,) of samples (m, 3) tesla, as the sensor reports them, in order of arrival."""
@@ -22,7 +21,5 @@ class MagScreen:
     @property
     def limit(self) -> np.ndarray:
         """(3,) tesla from which on a value is at its limit: given, found so far, or inf."""
-        given, found = self._par["sensor"]["mag_range"][0], self._found[0]
-        slack = np.minimum(1.5 * found["step"], TOLERANCE * found["limit"])
-        return np.where(np.isnan(given),
-                        np.where(found["limit"] > 0.0, found["limit"] - slack, np.inf), given)
+        found = self._found[0]
+        return np.asarray(found["limit"] * (1.0 - found["tolerance"]))

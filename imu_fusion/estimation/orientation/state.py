@@ -29,17 +29,6 @@ MAG_QUEUE = np.dtype([
 ], align=True)
 """Magnetometer samples that wait for the Imu to pass them (mag_queue)."""
 
-MAG_LIMIT = np.dtype([
-    ("seen", "?"),                       # whether there was a sample
-    ("limit", "f8", 3),                  # T, found so far; 0: none
-    ("last", "f8", 3),                   # T, raw
-    ("entry_step", "f8", 3),             # T, with which the present value was reached
-    ("largest", "f8", 3),                # T
-    ("step", "f8", 3),                   # T, smallest change seen
-    ("repeats", "i8", 3),                # of the present value
-], align=True)
-"""The search for the magnetometer's range (mag_rejection)."""
-
 GYRO_SPIKE = np.dtype([
     ("usual_change", "f8"),              # from sample to sample
     ("is_held", "?"),                    # a rate waits for the next to resemble it
@@ -126,8 +115,8 @@ STATE = np.dtype([
     ("acc_last", "f8", 3),               # raw
     ("history", ROTATION_HISTORY),
     ("queue", MAG_QUEUE),
-    ("mag_limit", MAG_LIMIT),
-    ("gyro_limit", FLAT_TOPS),           # the search for the gyroscope's range
+    ("mag_limit", FLAT_TOPS),            # the search for the magnetometer's range (mag_rejection)
+    ("gyro_limit", FLAT_TOPS),           # and the gyroscope's (gyro_limit)
     ("spike", GYRO_SPIKE),
     ("rest", REST),
     ("motion", MOTION),

@@ -8,12 +8,11 @@ import numpy as np
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.gnss_step import GnssStep
-from imu_fusion.estimation.smoother.imu_input import prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.imu_input import first_place, prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.initial import first_attitudes
 from imu_fusion.estimation.smoother.iterated import Solution, solve
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
-from imu_fusion.estimation.smoother.measurements.gnss_fix import required
 from imu_fusion.estimation.smoother.measurements.registry import (
     KINDS,
     MEASUREMENTS,
@@ -33,7 +32,7 @@ from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import likeliest
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
+from imu_fusion.samples.logs import FixLog, ImuLog, Log, MagLog, VelocityLog
 from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
@@ -86,29 +85,32 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
 
     Raises: as :meth:`.smoother.Smoother.run`.
     """
-    params, fix = model.params, required(given.fix)
+    params = model.params
     prepared = prepare_imu(given.imu, params)
-    frame = reference_frame(surface, fix)
+    first = first_place(given.fix, params.initial.position)
+    frame = reference_frame(surface, first)
     constraints = surface.constraints() if surface is not None else ()
     events = given.events
     detected = events is None and any(c.phase != "always" for c in constraints)
     if detected:
         events = find_jump(prepared.log, given.velocity, params.jump.takeoff,
                            params.jump.touchdown)
-    readings = _readings(given._replace(fix=fix), model, frame)
+    readings = _readings(given, model, frame)
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
-    around = surroundings_of(params, frame, fix, "mag" in measured)
+    around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
     problem = Problem(prepared, params, readings, around, constraints,
                       StatePrior.of(params, measured))
     hill = surface if isinstance(surface, Hill) and events is not None else None
+    start = None if params.initial.position is None else frame.to_enu(*first)
+    judge = "fix" if "fix" in measured else "mag"
     best = None
-    for quat in first_attitudes(problem, given.mag, given.initial_quat)[:_STARTS]:
+    for quat in first_attitudes(problem, given.mag, given.initial_quat, start)[:_STARTS]:
         found = _from_attitude(problem, frame, hill, quat, events)
         if found is None:
             continue
         if best is None or found.result.cost[-1] < best.result.cost[-1]:
             best = found
-        if found.result.converged and found.result.misfit().get("fix", np.inf) < _PLAUSIBLE:
+        if found.result.converged and found.result.misfit().get(judge, 0.0) < _PLAUSIBLE:
             break
     if best is None:
         raise EstimationError("the smoother diverged: noise far below that of the data, or "
@@ -126,10 +128,11 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
 
 def _readings(given, model, frame):
     """Readings of records.READING, under the model."""
-    logs = {"fix": given.fix, "velocity": given.velocity, "mag": given.mag}
-    if model.step_at is not None:
-        moved = given.fix.stamp >= model.step_at
-        logs |= {"fix": given.fix[~moved], "moved_fix": given.fix[moved]}
+    logs: dict[str, Log | None] = {"velocity": given.velocity, "mag": given.mag}
+    if given.fix is not None and given.fix.usable.any():
+        fix = given.fix[given.fix.usable]
+        moved = fix.stamp >= (np.inf if model.step_at is None else model.step_at)
+        logs |= {"fix": fix[~moved], "moved_fix": fix[moved]} if moved.any() else {"fix": fix}
     readings = prepare_readings(logs, frame, model.params)
     for name, factor in model.noise.items():
         readings["whiten"][readings["kind"] == KINDS[name]] /= factor

@@ -26,9 +26,10 @@ _WHITE = 0.3         # of the stated noise that is left white where the rest wan
 
 
 def fits(result: SmootherResult) -> bool:
-    """Whether innovations are white and no larger than they should be. Smaller ones are no
-    reason: what is stated then is too cautious, and not wrong."""
-    return (all(excess == 1.0 for excess in result.wander.values())
+    """Whether innovations of the receiver are white and no larger than they should be. Smaller
+    ones are no reason: what is stated then is too cautious, and not wrong. A magnetometer's are
+    none: iron is no noise."""
+    return (all(excess == 1.0 for name, excess in result.wander.items() if name != "mag")
             and all(size < _LARGE for name, size in result.misfit().items() if name != "mag"))
 
 
@@ -45,9 +46,11 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     Args:
         found: under ``model``. smooth: a model -> its Attempt.
     """
-    for other in _steps(found.result, model):
+    # Where fixes scatter more than stated, chance makes larger steps, and gains.
+    scatter = max(1.0, found.result.misfit().get("fix", 1.0))
+    for other in _steps(found.result, model, scatter):
         tried = smooth(other)
-        if _gain(tried, found) > _GAIN and _left(tried.result) <= max(
+        if _gain(tried, found) > _GAIN * scatter ** 2 and _left(tried.result) <= max(
                 1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
@@ -113,10 +116,10 @@ def _try(found, model, other, smooth):
     return (tried, other) if _gain(tried, found) > _GAIN else (found, model)
 
 
-def _steps(result: SmootherResult, model: Model) -> Iterator[Model]:
+def _steps(result: SmootherResult, model: Model, scatter: float) -> Iterator[Model]:
     """Models with a step of the fixes, where there seems to be one."""
     if "fix" in result.residuals:
-        for at in find_steps(result.innovations["fix"][0], result.residuals["fix"],
+        for at in find_steps(result.innovations["fix"][0], result.residuals["fix"] / scatter,
                              result.wander["fix"] == 1.0):
             yield model._replace(step_at=at)
 

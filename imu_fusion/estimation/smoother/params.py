@@ -169,9 +169,12 @@ class Initial(Parameters):
 
     attitude_sd: float = param(
         0.5, unit="rad", low=1e-3, high=3.2, doc="Standard deviation of the first attitude.")
+    position: tuple[float, ...] | None = param(
+        None, length=3, doc="Latitude, longitude (degrees) and ellipsoidal height (m) of the first "
+        "sample; unset: the first fix. With it no fix is needed; set position_sd beside it.")
     position_sd: float = param(
         100.0, unit="m", low=1e-2, doc="Standard deviation of the first position, about the first "
-        "fix.")
+        "fix or the position given.")
     speed_sd: float = param(
         30.0, unit="m/s", low=1e-3, doc="Standard deviation of the first velocity, about the first "
         "GNSS velocity or zero. Lower it for slow bodies without GNSS velocities.")

@@ -180,7 +180,7 @@ class Problem:
         sample = np.repeat(np.arange(len(self.x)), np.diff(self.reading_start))
         of_fix = self.readings["kind"] == FIX
         fixes = self.readings[of_fix]
-        apart = np.linalg.norm(fixes["value"] - fixes["value"][0], axis=1)
+        apart = np.linalg.norm(fixes["value"] - fixes["value"][:1], axis=1)
         moved = np.flatnonzero(apart * fixes["whiten"][:, 0, 0] > _MOVED)
         count = len(self.x) if not len(moved) else int(sample[of_fix][moved[0]]) + 1
         stamp = self.imu.log.stamp

@@ -245,6 +245,21 @@ def test_a_delay_that_puts_every_fix_on_a_sample_converges(jump):
     assert abs(delay - 0.1) < 4 * sd
 
 
+def test_a_start_that_is_given_stands_in_for_all_fixes(jump, recording):
+    """The hill holds the height and the side; how far it went is as uncertain as it says."""
+    imu, mag = recording.imu, recording.mag
+    motion = jump.at((imu.stamp - imu.stamp[0]) * 1e-9)
+    place = tuple(float(v) for v in jump.hill.origin.to_geodetic(motion.position_world[0]))
+    given = {"initial.position": place, "initial.position_sd": 0.1, "initial.speed_sd": 0.01,
+             "jump.takeoff": jump.t_takeoff, "jump.touchdown": jump.t_touchdown}
+    result = Smoother(SmootherParams().replace(**given), jump.hill).run(imu, mag)
+    error = result.samples["position_world"] - motion.position_world
+    sd = np.sqrt(result.samples["cov_position"].diagonal(0, 1, 2))
+    assert result.converged and sd[-1].max() > 5 * sd[0].max()
+    assert np.all(np.abs(error[::100]) < 4.0 * sd[::100] + 0.05)
+    assert np.abs(error[0]).max() < 0.4
+
+
 def test_what_cannot_be_estimated_says_so(jump, recording):
     smoother = Smoother(SmootherParams(), jump.hill)
     imu, mag, fix, velocity = (recording.imu, recording.mag, recording.fix, recording.velocity)
