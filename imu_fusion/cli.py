@@ -182,7 +182,8 @@ def info(bag: str, target: str | None) -> None:
     from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
-        click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
+        click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s"
+                   + (f", {reader.format}" if reader.format else ""))
         losses = read_losses(reader)
         rows = inspect_topics(reader)
         for warning in [*reader.warnings, *losses]:    # reading finds what is damaged inside
@@ -204,12 +205,12 @@ def info(bag: str, target: str | None) -> None:
         sys.exit(INCOMPLETE)
 
 
-def _tell(reader):
+def _tell(done):
     """Say what is wrong with a recording that has been read; end with INCOMPLETE if it was not
     all of it."""
-    for warning in reader.warnings:
+    for warning in done.warnings:
         click.echo(f"warning: {warning}", err=True)
-    if reader.damaged:
+    if done.damaged:
         sys.exit(INCOMPLETE)
 
 
@@ -221,52 +222,52 @@ def _number(value, form):
 @click.argument("source", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
-@click.option("--csv", "description", type=click.Path(), metavar="YAML",
-              help="SOURCE is a table of accelerometers; YAML names its columns, units, positions "
-                   "and axes.")
+@click.option("--description", "--csv", "description", type=click.Path(), metavar="YAML",
+              help="What SOURCE does not tell: columns, units and axes of a table.")
 @remap_option
 @overwrite_option
 def convert(source: str, out: str, topics: tuple[str, ...], description: str | None,
             remap: tuple[str, ...], overwrite: bool) -> None:
-    """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
+    """Copy the recording SOURCE into the rosbag2 MCAP directory OUT.
 
-    SOURCE may also be the folder of a phyphox CSV export (Accelerometer.csv, Gyroscope.csv, ...)
-    or an AvaNode log (.txt); they become imu/data_raw, imu/mag, fix and fix_velocity.
-    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With --csv
-    SOURCE is a table, and OUT.yaml becomes the parameter file that process takes.
+    SOURCE is a recording (MCAP, sqlite3, ROS 1), or a file, folder or zip archive of a
+    device, recognised by what is in it: phyphox, Sensor Logger, u-blox and NMEA, GPX, x-IMU3,
+    PX4 ULog, AvaNode, tables whose header names sensors, axes and units. Another table needs a
+    description; `imu_fusion describe` writes a first one. With accelerometers of an array in
+    it OUT.yaml becomes the parameter file that process takes. With --remap TOPIC:=OTHER the
+    topic OTHER of SOURCE is called TOPIC in OUT.
     """
-    if description is not None:
-        if topics or remap:
-            raise click.UsageError("--csv goes without --topic and --remap")
-        from imu_fusion.recordings.csv_import import import_csv
-        parameter_file, count = import_csv(source, description, out, overwrite)
-        click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
-        return
-    from imu_fusion.recordings.importers import import_files, importer_of
-    importer = importer_of(source)
-    if importer is not None:
-        if topics or remap:
-            raise click.UsageError("--topic and --remap are for recordings, not for other files")
-        counts = import_files(importer, source, out, overwrite)
-        click.echo(f"written: {out} with "
-                   + ", ".join(f"{n} of {topic}" for topic, n in sorted(counts.items())))
-        return
-    from imu_fusion.recordings.bag_reader import open_bag
-    from imu_fusion.recordings.bag_writer import BagWriter
-    from imu_fusion.recordings.repair import copy
-    from imu_fusion.recordings.targets import refuse_source
-    refuse_source(source, out)
-    names = {other: name for name, other in _remaps(remap).items()}
-    with open_bag(source) as reader:
-        kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
-        renamed = {reader.require(other).name: name for other, name in names.items()}
-        with (BagWriter(out, overwrite=overwrite, whole=True) as writer,
-              click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
-                                length=sum(reader.topics[t].count or 0 for t in kept),
-                                file=sys.stderr) as messages):
-            copy(reader, writer, kept, renamed, messages)
-    click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
-    _tell(reader)
+    from imu_fusion.recordings.convert import convert as convert_file
+
+    def watch(messages, count):
+        return click.progressbar(messages, label=f"converting {Path(source).name}",
+                                 length=count, file=sys.stderr)
+
+    done = convert_file(source, out, description, topics, _remaps(remap), overwrite, watch)
+    if done.format:
+        click.echo(f"{source}: {done.format}")
+    click.echo(f"written: {out} with "
+               + ", ".join(f"{n} of {topic}" for topic, n in sorted(done.counts.items()))
+               + (f", {done.parameter_file}" if done.parameter_file else ""))
+    _tell(done)
+
+
+@cli.command()
+@click.argument("source", type=click.Path())
+@click.option("--out", type=click.Path(), help="File to write; without it, the text is shown.")
+@click.option("--overwrite", is_flag=True, help="Replace it.")
+def describe(source: str, out: str | None, overwrite: bool) -> None:
+    """A first description, in YAML, of the table SOURCE.
+
+    Names and units are read from the header, the rest is guessed from the values: gravity
+    and the Earth's field are always there. Each guess is marked. Check it, then
+    `imu_fusion convert SOURCE OUT --description YAML`.
+    """
+    from imu_fusion.recordings.describe import describe as describe_file
+    text, said = describe_file(source, out, overwrite)
+    if text and out is None:
+        click.echo(text, nl=False)
+    click.echo(said, err=True)
 
 
 @cli.command(context_settings=PASS_ON)

@@ -39,3 +39,7 @@ class LayoutError(ImuFusionError, ValueError):
 
 class EstimationError(ImuFusionError):
     """An estimator cannot produce a meaningful result from what it was given."""
+
+
+class DeviceError(ImuFusionError):
+    """A device cannot be reached, or does not answer as it should."""

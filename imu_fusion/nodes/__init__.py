@@ -21,6 +21,7 @@ class Executable(NamedTuple):
 
 NODES = {
     "replayer": Executable("Play a recording on its topics.", ("pause", "resume", "step")),
+    "driver": Executable("Samples of a device, live or from its file, on the standard topics."),
     "recorder": Executable("Record topics into a rosbag2 MCAP directory."),
     "orientation_estimator": Executable(
         "Orientation from imu/data_raw and imu/mag, published on imu/data.",

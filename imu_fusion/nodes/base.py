@@ -117,16 +117,17 @@ class Node(rclpy.node.Node):
         """Release files; called once, whatever happened."""
 
     def start_diagnostics(self, task: str, status: Callable[
-            [], tuple[bytes, str, Mapping[str, object]]]) -> None:
+            [], tuple[bytes, str, Mapping[str, object]]],
+            hardware: Callable[[], str] = lambda: "imu_fusion") -> None:
         """Publish ``status() -> (level, message, {key: value})`` on `/diagnostics` at 1 Hz, as
-        diagnostic_updater would: named ``node: task``, for the hardware "imu_fusion"."""
+        diagnostic_updater would: named ``node: task``, for what ``hardware()`` names."""
         publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
         def publish():
             level, message, values = status()
             array = DiagnosticArray(status=[DiagnosticStatus(
                 level=level, name=f"{self.get_fully_qualified_name().lstrip('/')}: {task}",
-                message=message, hardware_id="imu_fusion",
+                message=message, hardware_id=hardware(),
                 values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
             array.header.stamp = self.get_clock().now().to_msg()
             publisher.publish(array)

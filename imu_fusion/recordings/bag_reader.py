@@ -20,6 +20,7 @@ from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.recordings.mcap_storage import McapStorage
 from imu_fusion.recordings.ros1_storage import Ros1Storage
+from imu_fusion.recordings.source_storage import SourceStorage, format_of
 from imu_fusion.recordings.sqlite_storage import SqliteStorage
 from imu_fusion.recordings.storage import (
     DamageError,
@@ -50,15 +51,19 @@ class TopicInfo:
     qos_profiles: list[dict] = field(default_factory=list)
 
 
-def open_bag(path: str | Path) -> "Reader":
+def open_bag(path: str | Path, description: str | Path | None = None) -> "Reader":
     """Open a recording for reading: a context manager with ``topics`` and ``messages``.
 
     Args:
         path: a rosbag2 directory, an ``.mcap`` or ``.db3`` file (also ``.mcap.zstd``,
-            ``.db3.zstd``), or a ROS 1 ``.bag``.
+            ``.db3.zstd``), a ROS 1 ``.bag``, or what a device has written in one of the formats of
+            :mod:`imu_fusion.sources.registry`.
+        description: YAML file that says what a table of a device holds, or what the export of a
+            device does not tell.
 
     Raises:
         BagError: nothing there, not a recording, or damaged beyond reading.
+        SampleError, ParameterError: the file of a device, or the description, is not usable.
     """
     path = Path(path)
     reader = Reader(path)
@@ -66,7 +71,10 @@ def open_bag(path: str | Path) -> "Reader":
         try:
             if not path.exists():
                 raise BagError(f"{path}: no such file or directory")
-            reader.open(_storage_files(path, reader.warnings))
+            if description is not None or not _is_recording(path):
+                reader.open_source(description)
+            else:
+                reader.open(_storage_files(path, reader.warnings))
         except (OSError, ValueError) as error:    # ValueError: a name that no file can have
             if isinstance(error, ImuFusionError):
                 raise
@@ -83,9 +91,6 @@ def open_bag(path: str | Path) -> "Reader":
 def _storage_files(path: Path, warnings: list[str]) -> list[Path]:
     """The files of a recording, in order; what is wrong with its metadata goes to ``warnings``."""
     if path.is_file():
-        if not path.name.endswith((*DATA_SUFFIXES, ".bag")):
-            raise BagError(f"{path}: not a recording; expected a rosbag2 directory or a "
-                           ".mcap, .db3 or .bag file")
         return [path]
     for suffix in DATA_SUFFIXES:
         files = sorted((p for p in path.iterdir() if p.name.endswith(suffix) and p.is_file()),
@@ -93,6 +98,13 @@ def _storage_files(path: Path, warnings: list[str]) -> list[Path]:
         if files:
             return _named(path, files, warnings)
     raise BagError(f"{path}: a directory without .mcap or .db3 files is not a recording")
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether the names say so; what is none may be of a device."""
+    if path.is_file():
+        return path.name.endswith((*DATA_SUFFIXES, ".bag"))
+    return any(file.name.endswith(DATA_SUFFIXES) for file in path.iterdir())
 
 
 def _split_index(path: Path) -> tuple[int, str]:
@@ -127,7 +139,8 @@ def _named(path: Path, files: list[Path], warnings: list[str]) -> list[Path]:
 
 class Reader:
     """A recording; ``warnings`` says what is wrong with it, as far as it is known by now: what is
-    damaged inside is found while it is read. ``damaged`` tells whether anything is lost."""
+    damaged inside is found while it is read. ``damaged`` tells whether anything is lost,
+    ``format`` what a device's file was taken for."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -135,6 +148,7 @@ class Reader:
         self.start_time = self.end_time = 0
         self.warnings: list[str] = []
         self.damaged = False    # messages are lost
+        self.format = ""
         self._storages: list[Storage] = []
         self._stored: dict[str, StoredTopic] = {}
         self._temporary: list[Any] = []
@@ -170,6 +184,28 @@ class Reader:
         if not self.topics and self.damaged:
             raise BagError(f"{self.path}: damaged, and nothing could be recovered "
                            f"({'; '.join(self.warnings)})")
+
+    def open_source(self, description: str | Path | None = None) -> None:
+        """Open what a device has written; see :func:`open_bag`."""
+        known = format_of(self.path)
+        content = None if description is None else read_yaml(description)
+        if known is None and description is None:
+            if self.path.is_dir():
+                raise BagError(f"{self.path}: a directory without .mcap or .db3 files is not a "
+                               "recording, and it holds no export of a device that is known")
+            raise BagError(f"{self.path}: not a recording; expected a rosbag2 directory, a .mcap, "
+                           ".db3 or .bag file, or the export of a device. A table of numbers "
+                           "needs a description: imu_fusion describe writes a first one")
+        # Where there is a description, a table is read as that says.
+        if content is not None and (known is None or not known.options):
+            known = None
+        self.format = "table as described" if known is None else known.about
+        self._storages.append(SourceStorage(self.path, self.lose, self.mention, known, content,
+                                            str(description)))
+        self._add(self._storages[0])
+        assert self._storages[0].times is not None
+        self.start_time, self.end_time = self._storages[0].times
+        self.end_time += 1
 
     def close(self) -> None:
         """Release the files."""

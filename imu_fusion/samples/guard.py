@@ -16,13 +16,11 @@ All of this follows from the sequence of the samples of a topic alone, not from 
 
 import enum
 from collections import Counter
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.samples.logs import Log
-
-AnyLog = TypeVar("AnyLog", bound=Log)
+from imu_fusion.samples.logs import AnyLog
 
 JUMP = 1_000_000_000
 """Nanoseconds. Transport delays reorder samples by less, sensors pause for less."""
