@@ -86,19 +86,10 @@ def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np
         if store:
             storage.row_start[k - first] = stored
         for m in range(recording.reading_start[k], recording.reading_start[k + 1]):
-            loss, weight = _linearise(recording.readings[m], x[k], follow, cov, step, model, rows)
+            loss, unlikely, stored = _take_reading(recording.readings[m], x[k], follow, delta, cov,
+                                                   step, model, rows, fit[m], storage, stored)
             cost += loss
-            # A weighted square touches the loss from above, where the nominal trajectory is.
-            surprise += 0.5 * loss
-            for i in range(3):
-                _put_component(i, weight, n, rows)
-                # Readings of fewer than three components have empty rows.
-                if rows.length > 0:
-                    value, root = _update(delta, cov, rows, weight * rows.residual[i])
-                    surprise += _surprise(value, root) - 0.5 * (weight * rows.residual[i]) ** 2
-                    fit[m].innovation[i] = value
-                    fit[m].residual[i] = rows.residual[i]
-                    stored = _store_row(stored, value, root, rows, storage)
+            surprise += unlikely
         for c in range(recording.contact_start[k], recording.contact_start[k + 1]):
             residual = put_row(recording.contacts[c], x[k], model, rows)
             cost += residual ** 2
@@ -121,6 +112,25 @@ def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np
                 storage.f_att[k - first] = step.f_att[:, :n]
                 storage.spread[k - first] = step.spread
     return cost, surprise
+
+
+@njit
+def _take_reading(reading, x, follow, delta, cov, step, model, rows, fit, storage, stored):
+    """Update by the rows of a reading; returns its loss, the negative logarithm of its likelihood,
+    and how many rows are kept."""
+    n = len(delta)
+    loss, weight = _linearise(reading, x, follow, cov, step, model, rows)
+    # A weighted square touches the loss from above, where the nominal trajectory is.
+    surprise = 0.5 * loss
+    for i in range(3):
+        _put_component(i, weight, n, rows)
+        # Readings of fewer than three components have empty rows.
+        if rows.length > 0:
+            value, root = _update(delta, cov, rows, weight * rows.residual[i])
+            surprise += _surprise(value, root) - 0.5 * (weight * rows.residual[i]) ** 2
+            fit.innovation[i], fit.residual[i] = value, rows.residual[i]
+            stored = _store_row(stored, value, root, rows, storage)
+    return loss, surprise, stored
 
 
 @njit
