@@ -140,7 +140,7 @@ def car(every: int, with_velocity: bool) -> Callable:
         imu, fix, velocity, _ = smoother_drive.load()
         frame = LocalFrame(fix.latitude_deg[0], fix.longitude_deg[0], fix.height[0])
         enu = frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
-        for seed in range(5):
+        for seed in range(2):
             rng, n = np.random.default_rng(seed), len(fix)
             off = wandering(n, 0.25, rng) + WHITE_SD * rng.standard_normal((n, 3))
             worse = FixLog(fix.stamp, *frame.to_geodetic(enu + off),
