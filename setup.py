@@ -60,7 +60,7 @@ setup(
                     "oracles": oracles, "docs": docs, "test": test},
     entry_points={"console_scripts": [
         "imu_fusion = imu_fusion.cli:main",
-        *[f"{node} = imu_fusion.nodes.{node}:main" for node in nodes],
+        *[f"{node} = imu_fusion.nodes:main" for node in nodes],
     ]},
     package_data={"imu_fusion": ["py.typed"], "imu_fusion.report": ["*.css", "*.js"],
                   "imu_fusion.nodes.flow": ["*.xml"]},

@@ -1,11 +1,10 @@
 """The command line: ``imu_fusion --help``.
 
 Every command prints errors of the user in one line and ends with exit code 1;
-wrong usage ends with 2, an interrupted command with 130. Where a recording was damaged and all
-that could be read of it was used, the code is 3.
+wrong usage ends with 2; one that SIGINT, SIGTERM or SIGHUP has ended with 130, 143 or 129. Where
+something was lost, in a damaged recording or on the way, and the rest was used, the code is 3.
 """
 
-import importlib
 import sys
 from pathlib import Path
 
@@ -14,13 +13,14 @@ from rich.console import Console
 from rich.table import Table
 
 import imu_fusion
+from imu_fusion import nodes
 from imu_fusion.demos import DEMOS
-from imu_fusion.errors import ImuFusionError, ParameterError
+from imu_fusion.errors import INCOMPLETE, ImuFusionError, ParameterError
 from imu_fusion.nodes import NODES
+from imu_fusion.signals import Interrupted, handled, interrupt
 
 PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True}
 console = Console(highlight=False)
-INCOMPLETE = 3
 
 
 class _Group(click.Group):
@@ -32,8 +32,6 @@ class _Group(click.Group):
         except ImuFusionError as error:
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
-        except KeyboardInterrupt:
-            ctx.exit(130)
         except ModuleNotFoundError as error:
             extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
             if extra is None:
@@ -104,8 +102,7 @@ def start_node(node: str, arguments: tuple[str, ...]) -> None:
 
     Such as --ros-args -p NAME:=VALUE -r FROM:=TO, or --help for its parameters.
     """
-    main_function = importlib.import_module(f"imu_fusion.nodes.{node}").main
-    sys.exit(main_function(list(arguments)))
+    sys.exit(nodes.main(arguments, node))
 
 
 @cli.command()
@@ -160,6 +157,7 @@ def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ..
     the same as those of `process`.
     """
     from imu_fusion.nodes.pipeline import run_pipeline
+    from imu_fusion.recordings.results import is_incomplete
     run_pipeline(bag, out, params_file, without, _remaps(remap), overwrite)
     click.echo(f"written: {out}")
     if with_report:
@@ -168,6 +166,8 @@ def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ..
         # BAG keeps the times of its messages, OUT has those of the replay, but our names.
         write_recording_report(out if remap else bag, out, path, params_file)
         click.echo(f"written: {path}")
+    if is_incomplete(out):
+        sys.exit(INCOMPLETE)
 
 
 @cli.command()
@@ -284,8 +284,8 @@ def describe(source: str, out: str | None, overwrite: bool) -> None:
               help="Wait for one of our nodes. Repeatable.")
 def play(bag: str, arguments: tuple[str, ...], **options) -> None:
     """Play BAG through the replayer node; further ARGUMENTS go to the node."""
-    from imu_fusion.nodes import replayer
-    sys.exit(replayer.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments]))
+    sys.exit(nodes.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments],
+                        "replayer"))
 
 
 @cli.command(context_settings=PASS_ON)
@@ -296,8 +296,8 @@ def play(bag: str, arguments: tuple[str, ...], **options) -> None:
 @overwrite_option
 def record(out: str, topics: tuple[str, ...], **options) -> None:
     """Record TOPICS (all, if none are given) into the rosbag2 MCAP directory OUT."""
-    from imu_fusion.nodes import recorder
-    sys.exit(recorder.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options)))
+    sys.exit(nodes.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options),
+                        "recorder"))
 
 
 def _ros_args(**values):
@@ -333,8 +333,10 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
     from imu_fusion.report.recording import write_recording_report
     refuse_files([bag, estimates, params_file], out)
     with announced_compiling(lambda text: click.echo(text, err=True)):
-        write_recording_report(bag, estimates, out, params_file)
+        complete = write_recording_report(bag, estimates, out, params_file).complete
     click.echo(f"written: {out}")
+    if not complete:
+        sys.exit(INCOMPLETE)
 
 
 @cli.command(cls=_ListingCommand, listing=("Demos", DEMOS))
@@ -411,7 +413,11 @@ def compile() -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    cli(prog_name="imu_fusion")
+    try:
+        with handled(interrupt):
+            cli(prog_name="imu_fusion")
+    except Interrupted as signal:
+        sys.exit(signal.code)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ PACKAGE = Path(imu_fusion.__file__).parent
 ARROWS = {
     "errors": (),
     "kernels": (),
+    "signals": (),
     "parameters": ("errors",),
     "geometry": ("errors", "kernels"),
     "samples": ("errors",),
@@ -30,14 +31,15 @@ ARROWS = {
     "estimation.avalanche": ("errors", "parameters", "samples", "sensors", "surfaces",
                              "estimation.orientation"),
     "evaluation": ("errors", "geometry", "samples"),
-    "messages": ("errors", "geometry", "samples", "estimation.orientation"),
+    # Rows become numbers of messages in kernels.
+    "messages": ("errors", "kernels", "geometry", "samples", "estimation.orientation"),
     "sources": ("errors", "parameters", "samples"),
     "sources.transports": ("errors", "sources"),
     "recordings": ("errors", "parameters", "samples", "messages", "sources", "sources.transports"),
     "streams": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
                 "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
                 "messages"),
-    "compile_ahead": ("errors", "kernels", "geometry", "samples", "surfaces",
+    "compile_ahead": ("errors", "kernels", "signals", "geometry", "samples", "surfaces",
                       "estimation.orientation", "estimation.acceleration_field",
                       "estimation.smoother", "messages", "streams"),
     "simulation": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
@@ -45,7 +47,7 @@ ARROWS = {
     "nodes": ("errors", "kernels", "parameters", "samples", "sensors", "surfaces",
               "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
               "messages", "sources", "sources.transports", "recordings", "streams",
-              "compile_ahead"),
+              "compile_ahead", "signals"),
     "batch": ("errors", "kernels", "messages", "recordings", "samples", "streams"),
     "report": ("errors", "kernels", "parameters", "geometry", "samples", "surfaces",
                "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
@@ -53,7 +55,7 @@ ARROWS = {
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
               "batch", "report"),
     "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",
-            "compile_ahead", "nodes", "batch", "report", "demos"),
+            "compile_ahead", "nodes", "batch", "report", "demos", "signals"),
 }
 # Arrows of one file, with the reason.
 ARROWS_OF_FILES = {
@@ -76,7 +78,7 @@ COMPUTING_OF_FILES = {
     "surfaces/elevation_grid.py": {"pyproj", "rasterio"},    # a terrain is a file
     # Formats take bytes that others have read, and some know a library for what is in them.
     **{f"sources/{name}.py": extra for name, extra in {
-        "source": {"re"}, "table": {"csv", "decimal", "re"}, "header": {"re"},
+        "source": {"re"}, "table": {"csv", "decimal", "re"}, "header": {"re"}, "sketch": {"re"},
         "registry": {"pathlib", "re"}, "avanode": {"re"},
         "sensor_logger": {"csv", "json", "pathlib"}, "ximu3": {"struct"}, "ulog": {"io", "pyulog"},
         "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib"},
@@ -89,7 +91,7 @@ ROS = {"rclpy", "launch", "launch_ros", "ament_index_python", "rcl_interfaces", 
 # Imports by a name that is made at run time hide an arrow.
 HIDDEN = {"importlib", "imp", "pkgutil", "runpy"}
 HIDDEN_OF_FILES = {
-    "cli.py": {"importlib"},             # `run NODE` imports one node
+    "nodes/__init__.py": {"importlib"},  # an executable imports its own node
     "demos/__init__.py": {"importlib"},  # `demo NAME` imports one demo
     "nodes/base.py": {"importlib"},      # message classes by the names of their types
     "report/html.py": {"importlib"},     # importlib.resources

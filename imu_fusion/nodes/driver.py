@@ -1,7 +1,6 @@
 """The driver: samples of a device, under the clock of this computer, on the standard topics."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from rclpy.qos import QoSProfile
 from imu_fusion.errors import DeviceError, ParameterError, SampleError
 from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, POSE, TWIST
 from imu_fusion.messages.samples import NoiseSd, sample_messages
-from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
+from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import reliable_qos, sensor_qos, steady_timer
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, param
@@ -377,8 +376,3 @@ class _File:
                   if len(part := log.between(self._played + 1, until + 1))]
         self._played = until
         return Lot(blocks, time.time_ns()), None if until >= self._last else _PLAYED
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run_node(Driver, args)
