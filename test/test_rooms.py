@@ -55,8 +55,9 @@ ARROWS = {
     "calibrate": ("errors", "geometry", "recordings", "sensors"),
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
               "batch", "report"),
-    "cli": ("errors", "kernels", "parameters", "recordings", "streams", "compile_ahead", "nodes",
-            "batch", "report", "calibrate", "demos", "signals"),
+    "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",
+            "compile_ahead", "nodes", "batch", "report", "calibrate", "demos",
+            "signals"),
 }
 # Arrows of one file, with the reason.
 ARROWS_OF_FILES = {
