@@ -7,7 +7,6 @@ recording and parameters the estimates are those of the nodes, bit for bit.
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
-from imu_fusion.recordings.results import LEFT_OUT, RECORDING, write_results
+from imu_fusion.recordings.results import left_out, write_results
 from imu_fusion.recordings.targets import refuse_source
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.registry import STAGES
@@ -160,19 +159,13 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
                     progress(f"{stage.node}: {report.summary}")
             warnings = list(reader.warnings)
             results = {report.node: report.results for report in reports if report.results}
-            write_results(writer.directory, results | _left_out(reader, reports))
+            write_results(writer.directory, results | left_out(
+                {report.node: report.refused for report in reports},
+                reader.warnings if reader.damaged else ()))
     warnings += [text for report in reports for text in report.findings]
     warnings += [f"{report.node}: {text}" for report in reports
                  for text in (*report.warnings, *report.remarks)]
     return reports, list(dict.fromkeys(warnings))
-
-
-def _left_out(reader: Reader, reports: Sequence[StageReport]) -> dict[str, dict]:
-    """What was lost or refused, as results.json holds it; empty where nothing was."""
-    found: dict[str, Any] = {report.node: report.refused for report in reports if report.refused}
-    if reader.damaged:
-        found[RECORDING] = list(reader.warnings)
-    return {LEFT_OUT: found} if found else {}
 
 
 def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | None = None,

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.points import at_antenna
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.state import BLOCKS
 from imu_fusion.evaluation.consistency import nees
@@ -28,13 +29,13 @@ _BOUND, _IDEAL = 1.96, 95.0  # of a standard normal distribution, and its share 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A SmootherResult with what it was made from: ``params``, ``surface`` or None, FixLog and
-    VelocityLog (or None) and ``origin``, int ns, the zero of the time axes."""
+    """A SmootherResult with what it was made from: ``params``, ``surface``, FixLog and VelocityLog
+    (None where there was none) and ``origin``, int ns, the zero of the time axes."""
 
     result: SmootherResult
     params: SmootherParams
     surface: Surface | None
-    fix: FixLog
+    fix: FixLog | None
     velocity: VelocityLog | None
     origin: int
 
@@ -45,6 +46,9 @@ class Smoothed:
 
     def fixes_world(self) -> tuple[FixLog, np.ndarray]:
         """Valid fixes: FixLog and positions (m, 3) m."""
+        if self.fix is None:
+            none = np.empty(0)
+            return FixLog(none.astype(np.int64), none, none, none, none, none), np.empty((0, 3))
         fix = self.fix[self.fix.usable]
         return fix, self.result.frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
 
@@ -55,12 +59,9 @@ class Smoothed:
 
     def antenna(self, stamp: np.ndarray) -> np.ndarray:
         """Position (m, 3) of the antenna at stamps of fixes, NaN outside of the samples."""
-        samples, states = self.result.samples, self.result.states
-        lever = states["gnss_lever_arm"][0] if "gnss_lever_arm" in states else \
-            np.tile(self.params.gnss.lever_arm, (len(samples), 1))
-        place = samples["position_world"] + Rotation.from_quat(
-            samples["quat_world_imu"]).apply(lever)
-        return interpolate(samples["stamp"], place, stamp - self.delay("gnss_time_offset"))
+        samples = at_antenna(self.result.samples, self.result.states, self.params)
+        return interpolate(samples["stamp"], samples["position_world"],
+                           stamp - self.delay("gnss_time_offset"))
 
 
 def interpolate(stamp: np.ndarray, columns: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -82,8 +83,10 @@ def smoother_sections(smoothed: Smoothed, reference: PoseLog | None = None) -> l
         sections.append(_jump(smoothed))
     if reference is not None:
         sections.append(_truth(smoothed, reference))
-    sections += [_velocity(smoothed), _attitude(smoothed), _errors(smoothed),
-                 _before_after(smoothed), _innovations(smoothed)]
+    sections += [_velocity(smoothed), _attitude(smoothed), _errors(smoothed)]
+    if smoothed.fix is not None:
+        sections.append(_before_after(smoothed))
+    sections.append(_innovations(smoothed))
     if smoothed.surface is not None:
         sections.append(_residuals(smoothed))
     return sections
@@ -107,7 +110,7 @@ def _trajectory(smoothed):
     _, fixes = smoothed.fixes_world()
     figure, stretch = space_figure(samples, smoothed.time, fixes, smoothed.surface)
     heights = f" Heights are stretched by {stretch:.1f}." if stretch > 1.0 else ""
-    place = "the origin of the surface" if smoothed.surface is not None else "the first fix"
+    place = "the origin of the surface" if smoothed.surface is not None else "the start"
     step = np.diff(samples["position_world"], axis=0)
     rows = (("length of the path", number(np.linalg.norm(step, axis=1).sum(), 1), "m"),
             *((f"extent {name}", number(np.ptp(samples["position_world"][:, i]), 1), "m")

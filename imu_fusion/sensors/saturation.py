@@ -202,7 +202,7 @@ def saturated_axes(gyr: np.ndarray, limit: ArrayLike) -> np.ndarray:
 
 
 def recover_rates(stamp: np.ndarray, gyr: np.ndarray, mag: np.ndarray,
-                  limit: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+                  missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Missing rates from the change of the field in imu axes.
 
     The normalised field b obeys ``db/dt = b x omega`` (B.3, with [b]x and not its
@@ -213,7 +213,7 @@ def recover_rates(stamp: np.ndarray, gyr: np.ndarray, mag: np.ndarray,
     Args:
         stamp: (n,) int64 ns. gyr: (n, 3) rad/s, bias removed.
         mag: (n, 3) tesla, calibrated, at the same stamps (its delay removed).
-        limit: rad/s, scalar or (3,).
+        missing: (n, 3) bool, rates at their limit (:func:`saturated_axes`).
 
     Returns:
         rates (n, 3), and a mask (n,) of samples with all three axes missing, which stay
@@ -223,10 +223,10 @@ def recover_rates(stamp: np.ndarray, gyr: np.ndarray, mag: np.ndarray,
         SampleError: shapes differ, or fewer than two samples.
     """
     gyr, mag = np.asarray(gyr, dtype=float), np.asarray(mag, dtype=float)
-    if gyr.shape != mag.shape or gyr.shape != (len(stamp), 3) or len(stamp) < 2:
-        raise SampleError(f"recover_rates: stamps ({len(stamp)},), rates {gyr.shape} and field "
-                          f"{mag.shape} must be (n,), (n, 3), (n, 3) with n of at least 2")
-    missing = saturated_axes(gyr, limit)
+    if (not gyr.shape == mag.shape == missing.shape == (len(stamp), 3)) or len(stamp) < 2:
+        raise SampleError(f"recover_rates: stamps ({len(stamp)},), rates {gyr.shape}, field "
+                          f"{mag.shape} and mask {missing.shape} must be (n,) and three times "
+                          "(n, 3) with n of at least 2")
     b = mag / np.linalg.norm(mag, axis=1, keepdims=True)
     # Symmetric difference quotient, one-sided at the ends (B.4).
     n = len(stamp)

@@ -7,13 +7,15 @@ end in :func:`smooth`, and so in the same messages.
 import json
 import math
 from collections.abc import Callable, Container, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError, MessageError, ParameterError
+from imu_fusion.estimation.orientation.params import OrientationParams
+from imu_fusion.estimation.orientation.recovered import recover
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.estimation.smoother.result import SmootherResult
@@ -41,7 +43,7 @@ IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
 INPUTS = {topic: SAMPLE_TYPES[layout.msgtype] for topic, layout in (
     (IMU_TOPIC, IMU), (MAG_TOPIC, MAG), (FIX_TOPIC, FIX), (VELOCITY_TOPIC, TWIST))}
-REQUIRED = (IMU_TOPIC, FIX_TOPIC)
+_REQUIRED = (IMU_TOPIC, FIX_TOPIC)
 
 ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC = "smoother/odometry", "smoother/imu"
 SMOOTHED_FIX_TOPIC, POSE_TOPIC = "smoother/fix", "smoother/pose"
@@ -92,6 +94,10 @@ class SmoothingParams(SmootherParams):
     OLD_NAMES: ClassVar[Mapping[str, str]] = {**SmootherParams.OLD_NAMES,
                                               "surface": "surface.file"}
 
+    recover_rates: bool = param(
+        False, doc="First recover rates beyond the gyroscope's range from the magnetometer, as the "
+        "orientation estimator does on a whole recording, and take them with their covariance. "
+        "Set it for a body that tumbles beyond the range.")
     surface: SurfaceFile = SurfaceFile()
     frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
@@ -120,6 +126,11 @@ class SmootherNodeParams(EstimatorNodeParams):
                                     "taken, and smoothing is refused until smoother/clear. Imu "
                                     "and magnetometer at 100 Hz take 32 MB an hour; smoothing "
                                     "takes more (docs/smoother.md).")
+
+
+def required_of(params: SmootherParams) -> tuple[str, ...]:
+    """Topics without which there is nothing to smooth: fixes are not, where the start is given."""
+    return _REQUIRED if params.initial.position is None else (IMU_TOPIC,)
 
 
 def outputs_of(params: SmoothingParams) -> dict[str, str]:
@@ -157,8 +168,8 @@ class SmootherStream(Stream):
 
     def restart(self) -> None:
         if self._merger.strict:
-            self._samples += _length(self._collected)[1]
-            self._longest = max(self._longest, self._collected, key=_length)
+            self._samples += self._length(self._collected)[1]
+            self._longest = max(self._longest, self._collected, key=self._length)
         self.dropped = 0
         self.bytes = 0
         self._collected = {topic: [] for topic in INPUTS}
@@ -197,21 +208,27 @@ class SmootherStream(Stream):
             raise EstimationError(f"{self.dropped} samples were dropped at the limit of "
                                   f"{self.limit / 1e6:g} MB: call smoother/clear, record less or "
                                   "raise memory_limit")
-        chosen = max(self._longest, self._collected, key=_length)
+        chosen = max(self._longest, self._collected, key=self._length)
         if self._samples:
-            total = self._samples + _length(self._collected)[1]
-            self.warn(f"the clock was set: only the longest stretch, {_length(chosen)[1]} of "
+            total = self._samples + self._length(self._collected)[1]
+            self.warn(f"the clock was set: only the longest stretch, {self._length(chosen)[1]} of "
                       f"{total} Imu samples, is smoothed")
         for parts in chosen.values():
             if len(parts) > 1:    # not again at the next call
                 parts[:] = [joined(parts)]
-        missing = [topic for topic in REQUIRED if not chosen[topic]]
+        missing = [topic for topic in required_of(self.params) if not chosen[topic]]
         if missing:
             raise EstimationError(
                 f"nothing to smooth: no samples on {' and '.join(missing)}"
                 + (" since the clock was set back" if self.restarts else ""))
         return {topic: INPUTS[topic].log(*parts[0], self.frame_ids[topic])
                 for topic, parts in chosen.items() if parts}
+
+    def _length(self, stretch):
+        """Whether a collection has what is needed, and its number of Imu samples."""
+        counts = [sum(len(stamp) for stamp, _ in stretch[topic])
+                  for topic in required_of(self.params)]
+        return min(counts) > 0, counts[0]
 
     def conclude(self) -> Conclusion:
         """What the samples of a whole recording make: the smoothed trajectory; its detail is
@@ -221,12 +238,6 @@ class SmootherStream(Stream):
         outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
         return Conclusion(messages(result.samples, outcome, self.params),
                           outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
-
-
-def _length(stretch):
-    """Whether a collection has what is needed, and its number of Imu samples."""
-    counts = [sum(len(stamp) for stamp, _ in stretch[topic]) for topic in REQUIRED]
-    return min(counts) > 0, counts[0]
 
 
 def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
@@ -243,8 +254,20 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoother(params, surface).run(logs[IMU_TOPIC], logs.get(MAG_TOPIC), logs[FIX_TOPIC],
-                                         logs.get(VELOCITY_TOPIC))
+    imu, mag = logs[IMU_TOPIC], logs.get(MAG_TOPIC)
+    if params.recover_rates:
+        imu = recover(imu, mag, recovery_params(params))
+        params = params.replace(**{"sensor.gyro_range": None})
+    return Smoother(params, surface).run(imu, mag, logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
+
+
+def recovery_params(params: SmootherParams) -> OrientationParams:
+    """Parameters of the orientation estimator that recovers rates for the smoother: its sensor, and
+    a body in free fall and under blows, whose force says nothing of gravity."""
+    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_range", "mag_offset", "mag_matrix")
+    return OrientationParams().replace(**{
+        "fusion.use_acc": False,
+        **{f"sensor.{name}": getattr(params.sensor, name) for name in shared}})
 
 
 @dataclass(frozen=True)
@@ -263,7 +286,13 @@ class Outcome:
         numbers: dict[str, Any] = {
             "samples": len(result.samples), "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
-            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag}
+            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
+            "adapted": result.adapted, "noise": result.noise,
+            "outliers": {name: asdict(found) for name, found in result.outliers().items()}}
+        if result.gnss_step is not None:
+            numbers["gnss_step"] = {"stamp": result.gnss_step.stamp,
+                                    "offset": result.gnss_step.offset.tolist(),
+                                    "sd": result.gnss_step.sd.tolist()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()
@@ -392,7 +421,9 @@ def _path(samples, stamp, world):
 
 def findings(logs: Mapping[str, Any]) -> list[str]:
     """What looks wrong with whole logs as recorded: texts."""
-    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC) + checks.check_fix(logs[FIX_TOPIC])
+    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
+    if FIX_TOPIC in logs:
+        found += checks.check_fix(logs[FIX_TOPIC])
     if MAG_TOPIC in logs:
         found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
     return [finding.text for finding in found]
@@ -402,8 +433,8 @@ def _configure(stage, params_file):
     (params,) = stage.read_params(params_file)
     if params.surface.file:
         load_surface(params.surface.file)  # a bad file is refused before anything is read
-    return replace(stage, outputs=outputs_of(params)), [params]
+    return replace(stage, required=required_of(params), outputs=outputs_of(params)), [params]
 
 
-STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, REQUIRED, OUTPUTS,
+STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, _REQUIRED, OUTPUTS,
               SmootherStream, findings, _configure)

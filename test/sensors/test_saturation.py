@@ -29,7 +29,8 @@ def test_one_and_two_missing_axes_are_recovered(clipped):
     imu, mag, truth = clipped
     missing = saturated_axes(imu.gyr, 6.0)
     assert (missing.sum(axis=1) == 1).any() and (missing.sum(axis=1) == 2).any()
-    rates, lost = recover_rates(imu.stamp, imu.gyr, mag.mag, 6.0)
+    rates, lost = recover_rates(imu.stamp, imu.gyr, mag.mag,
+                                saturated_axes(imu.gyr, 6.0))
     # An axis is observed as far as it leans away from the field, and its square counts.
     b = mag.mag / np.linalg.norm(mag.mag, axis=1, keepdims=True)
     for axis in range(3):
@@ -43,17 +44,19 @@ def test_one_and_two_missing_axes_are_recovered(clipped):
 
 def test_good_samples_and_lost_ones_stay(clipped):
     imu, mag, _ = clipped
-    rates, lost = recover_rates(imu.stamp, imu.gyr, mag.mag, 6.0)
+    rates, lost = recover_rates(imu.stamp, imu.gyr, mag.mag,
+                                saturated_axes(imu.gyr, 6.0))
     good = ~saturated_axes(imu.gyr, 6.0).any(axis=1)
     assert (rates[good] == imu.gyr[good]).all()
-    all_lost, lost = recover_rates(imu.stamp[:3], np.full((3, 3), 7.0), mag.mag[:3], 6.0)
+    all_lost, lost = recover_rates(imu.stamp[:3], np.full((3, 3), 7.0), mag.mag[:3],
+                                   np.ones((3, 3), bool))
     assert lost.all() and (all_lost == 7.0).all()
 
 
 def test_shapes_are_checked(clipped):
     imu, mag, _ = clipped
     with pytest.raises(SampleError, match="recover_rates"):
-        recover_rates(imu.stamp, imu.gyr, mag.mag[:-1], 6.0)
+        recover_rates(imu.stamp, imu.gyr, mag.mag[:-1], saturated_axes(imu.gyr, 6.0))
 
 
 @njit

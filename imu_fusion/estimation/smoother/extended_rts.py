@@ -28,11 +28,15 @@ from imu_fusion.estimation.smoother.extended_rts_model import (
     rate_matrix,
     to_ned,
 )
-from imu_fusion.estimation.smoother.imu_input import ImuInput, prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.imu_input import (
+    ImuInput,
+    first_place,
+    prepare_imu,
+    reference_frame,
+)
 from imu_fusion.estimation.smoother.initial import attitude_from_vectors
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
-from imu_fusion.estimation.smoother.measurements.gnss_fix import required
 from imu_fusion.estimation.smoother.measurements.registry import (
     FIX,
     MAG,
@@ -107,12 +111,11 @@ class ExtendedRts:
             raise EstimationError("method extended_rts knows hills only, no "
                                   f"{type(hill).__name__} (method: iterated)")
         prepared = prepare_imu(imu, params)
-        fix = required(fix)
-        frame = reference_frame(hill, fix)
+        frame = reference_frame(hill, first_place(fix, None))
         if hill is not None and events is None:
             events = find_jump(prepared.log, velocity, params.jump.takeoff, params.jump.touchdown)
         readings = prepare_readings({"fix": fix, "velocity": velocity, "mag": mag}, frame, params)
-        around = surroundings_of(params, frame, fix, magnetic=True)
+        around = surroundings_of(params, frame, int(prepared.log.stamp[0]), magnetic=True)
         model = Model(hill.axes if hill is not None else hill_axes(0.0),
                       np.array([0.0, 0.0, around.gravity]), ENU_NED @ around.magnetic_field, hill)
         data = _bind(model, prepared, readings, events, params)

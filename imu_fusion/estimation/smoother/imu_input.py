@@ -1,7 +1,8 @@
 """From logs to what the smoother starts from: where the world is, Imu samples with gaps bridged and
 clipped readings flagged."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,20 +17,35 @@ _LEAST = 10   # Imu samples: of fewer, steps and noise of a sample have no meani
 _FULL_SCALE = 0.999   # of a range from which on a reading counts as clipped: logs round it
 
 
-def reference_frame(surface: Surface | None, fix: FixLog) -> LocalFrame:
-    """The surface's frame, or one at the first usable fix.
+def first_place(fix: FixLog | None, given: Sequence[float] | None) -> tuple[float, ...]:
+    """Latitude, longitude (degrees) and height (m) of the start: as given, or the first usable
+    fix.
+
+    Raises:
+        EstimationError: there is neither.
+    """
+    if given is not None:
+        return tuple(given)
+    if fix is None or not fix.usable.any():
+        raise EstimationError("no valid GNSS fix: give the start (initial.position), or the "
+                              "position cannot be estimated. Orientation alone is the job of the "
+                              "orientation estimator")
+    i = np.flatnonzero(fix.usable)[0]
+    return float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
+
+
+def reference_frame(surface: Surface | None, first: tuple[float, ...]) -> LocalFrame:
+    """The surface's frame, or one at the :func:`first_place`.
 
     Raises:
         EstimationError: the surface is elsewhere.
     """
-    i = np.flatnonzero(fix.usable)[0]
-    first = float(fix.latitude_deg[i]), float(fix.longitude_deg[i]), float(fix.height[i])
     if surface is None:
         return LocalFrame(*first)
     away = float(np.linalg.norm(surface.origin.to_enu(*first)))
     if away > _FAR:
         raise EstimationError(
-            f"the surface's origin is {away / 1e3:.0f} km from the first fix (latitude "
+            f"the surface's origin is {away / 1e3:.0f} km from the start (latitude "
             f"{first[0]:.5f}, longitude {first[1]:.5f}): the surface is not that of this "
             "recording, or its origin is mistyped")
     return surface.origin
@@ -86,6 +102,9 @@ def prepare_imu(imu: ImuLog, params: SmootherParams) -> ImuInput:
         clipped.append(lost & recorded[:, None])
         either = lost[1:] | lost[:-1]
         noise.append(np.where(either, unknown, density) ** 2)
+    if imu.gyr_sd is not None:
+        sd = np.maximum(imu.gyr_sd[1:], imu.gyr_sd[:-1])
+        noise[0] = np.maximum(noise[0], sd ** 2 * np.diff(imu.stamp)[:, None] * 1e-9)
     return ImuInput(imu, recorded, np.concatenate(clipped, axis=1), np.concatenate(noise, axis=1))
 
 
@@ -104,6 +123,10 @@ def _bridged(imu: ImuLog, longest: float) -> tuple[ImuLog, np.ndarray]:
     order = np.argsort(stamp, kind="stable")
     recorded = np.concatenate([recorded, np.zeros(len(added), bool)])[order]
     since = stamp[order] - imu.stamp[0]
-    gyr, acc = (np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v[:, i])
-                                 for i in range(3)]) for v in (imu.gyr, imu.acc))
-    return ImuLog(stamp=stamp[order], gyr=gyr, acc=acc, frame_id=imu.frame_id), recorded
+
+    def bridged(values: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v) for v in values.T])
+
+    sd = None if imu.gyr_sd is None else bridged(imu.gyr_sd)
+    return replace(imu, stamp=stamp[order], gyr=bridged(imu.gyr), acc=bridged(imu.acc),
+                   gyr_sd=sd), recorded

@@ -52,8 +52,8 @@ def headings(quat: np.ndarray, count: int) -> np.ndarray:
     return (turns * scipy.spatial.transform.Rotation.from_quat(quat)).as_quat()
 
 
-def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarray | None
-                    ) -> np.ndarray:
+def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarray | None,
+                    start: np.ndarray | None = None) -> np.ndarray:
     """Set the first position and velocity of the problem's prior; attitudes (k, 4) to start from,
     the most plausible first.
 
@@ -61,15 +61,16 @@ def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarr
         problem: not yet solved.
         mag: the magnetometer's samples.
         initial_quat: (4,) a first guess; found from force and field when None.
+        start: (3,) m, the first position where it is given; else that of the first fix.
 
     Raises:
-        EstimationError: no fix within the Imu samples.
+        EstimationError: no start, and no fix within the Imu samples.
     """
     kind, value = problem.readings["kind"], problem.readings["value"]
-    if not np.any(kind == FIX):
+    if start is None and not np.any(kind == FIX):
         raise EstimationError("no fix lies within the Imu recording: do the stamps belong "
                               "together?")
-    problem.mean[POS:POS + 3] = value[kind == FIX][0]
+    problem.mean[POS:POS + 3] = value[kind == FIX][0] if start is None else start
     if np.any(kind == VELOCITY):
         problem.mean[VEL:VEL + 3] = value[kind == VELOCITY][0]
     log = problem.imu.log

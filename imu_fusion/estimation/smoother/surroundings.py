@@ -9,7 +9,6 @@ from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.geometry.gravity import earth_rate_world, normal_gravity
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
-from imu_fusion.samples.logs import FixLog
 
 
 @dataclass(frozen=True)
@@ -22,10 +21,10 @@ class Surroundings:
     magnetic_field: np.ndarray
 
 
-def surroundings_of(params: SmootherParams, frame: LocalFrame, fix: FixLog, magnetic: bool
+def surroundings_of(params: SmootherParams, frame: LocalFrame, stamp: int, magnetic: bool
                     ) -> Surroundings:
     """Gravity and, with a magnetometer, the magnetic field: as given, or those at the origin of the
-    frame and the stamp of the first fix."""
+    frame and at a stamp (ns)."""
     gravity = params.gravity
     if gravity is None:
         gravity = float(normal_gravity(frame.latitude_deg, frame.height))
@@ -34,5 +33,5 @@ def surroundings_of(params: SmootherParams, frame: LocalFrame, fix: FixLog, magn
         field = np.array(params.magnetic_field)
     elif magnetic:
         field = magnetic_field_world(frame.latitude_deg, frame.longitude_deg, frame.height,
-                                     decimal_year(fix.stamp[0]))
+                                     decimal_year(stamp))
     return Surroundings(gravity, earth_rate_world(frame.latitude_deg), field * MICRO)

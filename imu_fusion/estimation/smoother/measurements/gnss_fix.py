@@ -1,6 +1,5 @@
 """A fix: where the antenna was. p + R l + wandering error, at its stamp less the delay."""
 
-from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.measurements.gnss import chosen, put_gyr_scale, roots, vector
 from imu_fusion.estimation.smoother.measurements.measurement import (
     Measurement,
@@ -13,18 +12,6 @@ from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, POS, VEL, slow
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import FixLog
-
-
-def required(fix: FixLog | None) -> FixLog:
-    """The usable fixes of a log.
-
-    Raises:
-        EstimationError: there are none.
-    """
-    if fix is None or not fix.usable.any():
-        raise EstimationError("no valid GNSS fix: position cannot be estimated. Orientation alone "
-                              "is the job of the orientation estimator")
-    return fix[fix.usable]
 
 
 def prepare(fix: FixLog, frame: LocalFrame, params: SmootherParams) -> Readings:

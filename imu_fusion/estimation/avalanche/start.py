@@ -1,0 +1,92 @@
+"""Rest and motion: when the ball was entrained, and when it stopped.
+
+Winkler 2025 (section 4.1.1) aligns with the last 0.2 s before the entrainment. A recording has
+more than one rest: the ball was carried there and is dug out later. The avalanche is what lies
+between two rests and is the most violent.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # its parts are loaded where they are first used
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.samples.logs import ImuLog, seconds
+
+_WINDOW = 0.2        # s, that must be quiet around a sample at rest
+_SHORTEST = 0.5      # s, of a rest
+# Range of what is quiet within a window: four to five standard deviations of noise, so that of
+# the sensors of the paper passes, and less than a body in motion shows.
+_QUIET_RATE = 0.15   # rad/s
+_QUIET_FORCE = 3.0   # m/s^2
+# The ball moves where the mean of a few samples deviates from the rest by more than this.
+_ONSET_SDS = 5.0
+_ONSET_FORCE = 0.15  # m/s^2, and at least by that
+_ONSET_RATE = 0.02   # rad/s
+_STANDARD_GRAVITY = 9.80665
+
+
+@dataclass(frozen=True)
+class MotionSpan:
+    """First sample of the motion, first of the rest after it (its end where there is none), and
+    the rest before it as samples [rest_start, start); gyr_bias (3,) rad/s and force (3,) m/s^2,
+    its means."""
+
+    rest_start: int
+    start: int
+    stop: int
+    gyr_bias: np.ndarray
+    force: np.ndarray
+
+
+def find_motion(imu: ImuLog) -> MotionSpan:
+    """The most violent motion between two rests.
+
+    Args:
+        imu: ImuLog, n samples.
+
+    Raises:
+        EstimationError: no rest, or nothing but rest.
+    """
+    time = seconds(imu.stamp, imu.stamp[0])
+    step = float(np.median(np.diff(time)))
+    width = max(int(round(_WINDOW / step)), 3)
+    still = np.ones(len(imu), bool)
+    for values, limit in ((imu.gyr, _QUIET_RATE), (imu.acc, _QUIET_FORCE)):
+        high = scipy.ndimage.maximum_filter1d(values, width, axis=0, mode="nearest")
+        low = scipy.ndimage.minimum_filter1d(values, width, axis=0, mode="nearest")
+        still &= (high - low).max(axis=1) < limit
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    rests = [(a, b) for a, b in edges.reshape(-1, 2) if (b - a) * step >= _SHORTEST]
+    if not rests:
+        raise EstimationError(f"no rest of {_SHORTEST} s in the recording: the ball's first "
+                              "attitude is not known; begin the recording before it moves")
+    violence = np.concatenate([[0.0], np.cumsum(
+        (np.linalg.norm(imu.acc, axis=1) - _STANDARD_GRAVITY) ** 2)])
+    begins, ends = [b for _, b in rests], [a for a, _ in rests[1:]] + [len(imu)]
+    which = int(np.argmax([violence[e] - violence[b] for b, e in zip(begins, ends)]))
+    if begins[which] >= len(imu):
+        raise EstimationError("nothing but rest in the recording: where is the motion?")
+    rest_start, quiet_until, stop = rests[which][0], begins[which], ends[which]
+    level = slice(max(rest_start, quiet_until - 10 * width), quiet_until)
+    away = _away(imu, level, slice(quiet_until, stop), 3)
+    start = quiet_until + int(np.argmax(away)) if away.any() else stop
+    if which + 1 < len(rests):
+        # What is quiet can still be coming to rest.
+        begin, end = rests[which + 1]
+        slow = np.flatnonzero(_away(imu, slice((begin + end) // 2, end), slice(begin, end),
+                                    width // 2))
+        stop = begin + int(slow[-1]) + 1 if len(slow) else begin
+    return MotionSpan(level.start, start, stop, imu.gyr[level].mean(axis=0),
+                      imu.acc[level].mean(axis=0))
+
+
+def _away(imu, level, part, width):
+    """Mask of the samples of a part (slice) that deviate from the mean of a rest (slice ``level``),
+    in the mean of ``width`` samples."""
+    away = np.zeros(part.stop - part.start, bool)
+    for values, least in ((imu.gyr, _ONSET_RATE), (imu.acc, _ONSET_FORCE)):
+        mean, sd = values[level].mean(axis=0), values[level].std(axis=0)
+        smooth = scipy.ndimage.uniform_filter1d(values[part] - mean, width, axis=0)
+        away |= (np.abs(smooth) > np.maximum(_ONSET_SDS * sd / np.sqrt(width), least)).any(axis=1)
+    return away
