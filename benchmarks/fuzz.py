@@ -35,7 +35,7 @@ from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.file import load
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.recordings.csv_import import import_csv
+from imu_fusion.recordings.convert import convert
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.surfaces.file import load_surface
 
@@ -145,12 +145,12 @@ def read_recording(path: Path) -> None:
 
 def read_csv(path: Path) -> None:
     """What ``convert --csv`` does with a table."""
-    import_csv(path, path.with_name("table.yaml"), path.with_name("out"), overwrite=True)
+    convert(path, path.with_name("out"), path.with_name("table.yaml"), overwrite=True)
 
 
 def read_description(path: Path) -> None:
     """What ``convert --csv`` does with a description."""
-    import_csv(path.with_name("table.csv"), path, path.with_name("out"), overwrite=True)
+    convert(path.with_name("table.csv"), path.with_name("out"), path, overwrite=True)
 
 
 KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {

@@ -33,6 +33,7 @@ HERE = Path(__file__).resolve().parents[1]
 BAG = HERE / "bags" / "broad_06_fast_rotation"
 RATE = 286  # Hz, of each topic
 LONG, SHORT, LIVE = 240, 40, 30  # s of recorded time
+STARTED = 5 * 10**9  # ns, after which delays count: an orientation begins with a second at once
 TOPICS = ("imu/data_raw", "imu/mag", "imu/data")
 AT_RATE_ZERO = ("replayer", "orientation_estimator", "recorder")
 BOUND = ("first", "middle", "last")
@@ -189,7 +190,8 @@ def live_once(checkout, bag, nodes_there, folder):
                            ("/acceleration_field/imu", "/accelerometers/back")):
         made, came = times.get(output, {}), times.get(source, {})
         if made:
-            delays[output] = [(made[s] - came[s]) * 1e-6 for s in made if s in came]
+            begin = min(made) + STARTED
+            delays[output] = [(made[s] - came[s]) * 1e-6 for s in made if s in came and s > begin]
     return share, delays
 
 

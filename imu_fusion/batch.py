@@ -17,7 +17,7 @@ from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
-from imu_fusion.recordings.results import FINDINGS, LEFT_OUT, RECORDING, write_results
+from imu_fusion.recordings.results import FINDINGS, left_out, write_results
 from imu_fusion.recordings.targets import refuse_source
 from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Verdict
@@ -174,7 +174,9 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
             warnings = list(reader.warnings)
             results: dict[str, Any] = {
                 report.node: report.results for report in reports if report.results}
-            write_results(writer.directory, results | _found(reports) | _left_out(reader, reports))
+            write_results(writer.directory, results | _found(reports) | left_out(
+                {report.node: report.refused for report in reports},
+                reader.warnings if reader.damaged else ()))
     warnings += [finding.text for report in reports for finding in report.findings]
     warnings += [f"{report.node}: {text}" for report in reports
                  for text in (*report.warnings, *report.remarks)]
@@ -185,14 +187,6 @@ def _found(reports: Sequence[StageReport]) -> dict[str, Any]:
     """What looks wrong with the samples, as results.json holds it; empty where nothing does."""
     found = dict.fromkeys(finding.text for report in reports for finding in report.findings)
     return {FINDINGS: [*found]} if found else {}
-
-
-def _left_out(reader: Reader, reports: Sequence[StageReport]) -> dict[str, Any]:
-    """What was lost or refused, as results.json holds it; empty where nothing was."""
-    found: dict[str, Any] = {report.node: report.refused for report in reports if report.refused}
-    if reader.damaged:
-        found[RECORDING] = list(reader.warnings)
-    return {LEFT_OUT: found} if found else {}
 
 
 def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | None = None,

@@ -1,11 +1,10 @@
 """The command line: ``imu_fusion --help``.
 
 Every command prints errors of the user in one line and ends with exit code 1;
-wrong usage ends with 2, an interrupted command with 130. Where a recording was damaged and all
-that could be read of it was used, the code is 3.
+wrong usage ends with 2; one that SIGINT, SIGTERM or SIGHUP has ended with 130, 143 or 129. Where
+something was lost, in a damaged recording or on the way, and the rest was used, the code is 3.
 """
 
-import importlib
 import sys
 from pathlib import Path
 
@@ -14,13 +13,14 @@ from rich.console import Console
 from rich.table import Table
 
 import imu_fusion
+from imu_fusion import nodes
 from imu_fusion.demos import DEMOS
-from imu_fusion.errors import ImuFusionError, ParameterError
+from imu_fusion.errors import INCOMPLETE, ImuFusionError, ParameterError
 from imu_fusion.nodes import NODES
+from imu_fusion.signals import Interrupted, handled, interrupt
 
 PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True}
 console = Console(highlight=False)
-INCOMPLETE = 3
 
 
 class _Group(click.Group):
@@ -32,8 +32,6 @@ class _Group(click.Group):
         except ImuFusionError as error:
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
-        except KeyboardInterrupt:
-            ctx.exit(130)
         except ModuleNotFoundError as error:
             extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
             if extra is None:
@@ -104,8 +102,7 @@ def start_node(node: str, arguments: tuple[str, ...]) -> None:
 
     Such as --ros-args -p NAME:=VALUE -r FROM:=TO, or --help for its parameters.
     """
-    main_function = importlib.import_module(f"imu_fusion.nodes.{node}").main
-    sys.exit(main_function(list(arguments)))
+    sys.exit(nodes.main(arguments, node))
 
 
 @cli.command()
@@ -163,6 +160,7 @@ def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ..
     the same as those of `process`.
     """
     from imu_fusion.nodes.pipeline import run_pipeline
+    from imu_fusion.recordings.results import is_incomplete
     run_pipeline(bag, out, params_file, without, _remaps(remap), overwrite)
     click.echo(f"written: {out}")
     if with_report:
@@ -171,6 +169,8 @@ def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ..
         # BAG keeps the times of its messages, OUT has those of the replay, but our names.
         write_recording_report(out if remap else bag, out, path, params_file)
         click.echo(f"written: {path}")
+    if is_incomplete(out):
+        sys.exit(INCOMPLETE)
 
 
 @cli.command()
@@ -185,7 +185,8 @@ def info(bag: str, target: str | None) -> None:
     from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
-        click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s")
+        click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s"
+                   + (f", {reader.format}" if reader.format else ""))
         losses = read_losses(reader)
         rows = inspect_topics(reader)
         for warning in [*reader.warnings, *losses]:    # reading finds what is damaged inside
@@ -207,12 +208,12 @@ def info(bag: str, target: str | None) -> None:
         sys.exit(INCOMPLETE)
 
 
-def _tell(reader):
+def _tell(done):
     """Say what is wrong with a recording that has been read; end with INCOMPLETE if it was not
     all of it."""
-    for warning in reader.warnings:
+    for warning in done.warnings:
         click.echo(f"warning: {warning}", err=True)
-    if reader.damaged:
+    if done.damaged:
         sys.exit(INCOMPLETE)
 
 
@@ -224,52 +225,52 @@ def _number(value, form):
 @click.argument("source", type=click.Path())
 @click.argument("out", type=click.Path())
 @click.option("--topic", "topics", multiple=True, help="Keep only this topic. Repeatable.")
-@click.option("--csv", "description", type=click.Path(), metavar="YAML",
-              help="SOURCE is a table of accelerometers; YAML names its columns, units, positions "
-                   "and axes.")
+@click.option("--description", "--csv", "description", type=click.Path(), metavar="YAML",
+              help="What SOURCE does not tell: columns, units and axes of a table.")
 @remap_option
 @overwrite_option
 def convert(source: str, out: str, topics: tuple[str, ...], description: str | None,
             remap: tuple[str, ...], overwrite: bool) -> None:
-    """Copy the recording SOURCE (MCAP, sqlite3, ROS 1) into the rosbag2 MCAP directory OUT.
+    """Copy the recording SOURCE into the rosbag2 MCAP directory OUT.
 
-    SOURCE may also be the folder of a phyphox CSV export (Accelerometer.csv, Gyroscope.csv, ...)
-    or an AvaNode log (.txt); they become imu/data_raw, imu/mag, fix and fix_velocity.
-    With --remap TOPIC:=OTHER the topic OTHER of SOURCE is called TOPIC in OUT. With --csv
-    SOURCE is a table, and OUT.yaml becomes the parameter file that process takes.
+    SOURCE is a recording (MCAP, sqlite3, ROS 1), or a file, folder or zip archive of a
+    device, recognised by what is in it: phyphox, Sensor Logger, u-blox and NMEA, GPX, x-IMU3,
+    PX4 ULog, AvaNode, tables whose header names sensors, axes and units. Another table needs a
+    description; `imu_fusion describe` writes a first one. With accelerometers of an array in
+    it OUT.yaml becomes the parameter file that process takes. With --remap TOPIC:=OTHER the
+    topic OTHER of SOURCE is called TOPIC in OUT.
     """
-    if description is not None:
-        if topics or remap:
-            raise click.UsageError("--csv goes without --topic and --remap")
-        from imu_fusion.recordings.csv_import import import_csv
-        parameter_file, count = import_csv(source, description, out, overwrite)
-        click.echo(f"written: {out} with {count} samples of each sensor, {parameter_file}")
-        return
-    from imu_fusion.recordings.importers import import_files, importer_of
-    importer = importer_of(source)
-    if importer is not None:
-        if topics or remap:
-            raise click.UsageError("--topic and --remap are for recordings, not for other files")
-        counts = import_files(importer, source, out, overwrite)
-        click.echo(f"written: {out} with "
-                   + ", ".join(f"{n} of {topic}" for topic, n in sorted(counts.items())))
-        return
-    from imu_fusion.recordings.bag_reader import open_bag
-    from imu_fusion.recordings.bag_writer import BagWriter
-    from imu_fusion.recordings.repair import copy
-    from imu_fusion.recordings.targets import refuse_source
-    refuse_source(source, out)
-    names = {other: name for name, other in _remaps(remap).items()}
-    with open_bag(source) as reader:
-        kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
-        renamed = {reader.require(other).name: name for other, name in names.items()}
-        with (BagWriter(out, overwrite=overwrite, whole=True) as writer,
-              click.progressbar(reader.messages(kept), label=f"converting {Path(source).name}",
-                                length=sum(reader.topics[t].count or 0 for t in kept),
-                                file=sys.stderr) as messages):
-            copy(reader, writer, kept, renamed, messages)
-    click.echo(f"written: {out} with {sum(writer.counts.values())} messages")
-    _tell(reader)
+    from imu_fusion.recordings.convert import convert as convert_file
+
+    def watch(messages, count):
+        return click.progressbar(messages, label=f"converting {Path(source).name}",
+                                 length=count, file=sys.stderr)
+
+    done = convert_file(source, out, description, topics, _remaps(remap), overwrite, watch)
+    if done.format:
+        click.echo(f"{source}: {done.format}")
+    click.echo(f"written: {out} with "
+               + ", ".join(f"{n} of {topic}" for topic, n in sorted(done.counts.items()))
+               + (f", {done.parameter_file}" if done.parameter_file else ""))
+    _tell(done)
+
+
+@cli.command()
+@click.argument("source", type=click.Path())
+@click.option("--out", type=click.Path(), help="File to write; without it, the text is shown.")
+@click.option("--overwrite", is_flag=True, help="Replace it.")
+def describe(source: str, out: str | None, overwrite: bool) -> None:
+    """A first description, in YAML, of the table SOURCE.
+
+    Names and units are read from the header, the rest is guessed from the values: gravity
+    and the Earth's field are always there. Each guess is marked. Check it, then
+    `imu_fusion convert SOURCE OUT --description YAML`.
+    """
+    from imu_fusion.recordings.describe import describe as describe_file
+    text, said = describe_file(source, out, overwrite)
+    if text and out is None:
+        click.echo(text, nl=False)
+    click.echo(said, err=True)
 
 
 @cli.command(context_settings=PASS_ON)
@@ -286,8 +287,8 @@ def convert(source: str, out: str, topics: tuple[str, ...], description: str | N
               help="Wait for one of our nodes. Repeatable.")
 def play(bag: str, arguments: tuple[str, ...], **options) -> None:
     """Play BAG through the replayer node; further ARGUMENTS go to the node."""
-    from imu_fusion.nodes import replayer
-    sys.exit(replayer.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments]))
+    sys.exit(nodes.main([*_ros_args(bag=str(Path(bag).absolute()), **options), *arguments],
+                        "replayer"))
 
 
 @cli.command(context_settings=PASS_ON)
@@ -298,8 +299,8 @@ def play(bag: str, arguments: tuple[str, ...], **options) -> None:
 @overwrite_option
 def record(out: str, topics: tuple[str, ...], **options) -> None:
     """Record TOPICS (all, if none are given) into the rosbag2 MCAP directory OUT."""
-    from imu_fusion.nodes import recorder
-    sys.exit(recorder.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options)))
+    sys.exit(nodes.main(_ros_args(out=str(Path(out).absolute()), topics=topics, **options),
+                        "recorder"))
 
 
 def _ros_args(**values):
@@ -335,8 +336,40 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
     from imu_fusion.report.recording import write_recording_report
     refuse_files([bag, estimates, params_file], out)
     with announced_compiling(lambda text: click.echo(text, err=True)):
-        write_recording_report(bag, estimates, out, params_file)
+        complete = write_recording_report(bag, estimates, out, params_file).complete
     click.echo(f"written: {out}")
+    if not complete:
+        sys.exit(INCOMPLETE)
+
+
+@cli.group()
+def calibrate() -> None:
+    """Calibrate a sensor from a recording, as a parameter file."""
+
+
+@calibrate.command("magnetometer")
+@click.argument("bag", type=click.Path())
+@click.option("--topic", default="imu/mag", show_default=True, help="Its topic in BAG.")
+@click.option("--out", type=click.Path(), help="Parameter file to write.")
+def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
+    """Hard and soft iron from BAG, in which the sensor turned about all axes.
+
+    Prints how well it is determined, and sensor.mag_offset and sensor.mag_matrix as the
+    orientation estimator and the smoother take them.
+    """
+    from imu_fusion import calibrate as calibration
+    found, remarks = calibration.calibrate_recorded_magnetometer(bag, topic)
+    table = Table("magnetometer", "")
+    for name, value in calibration.magnetometer_report(found):
+        table.add_row(name, value)
+    console.print(table)
+    for remark in remarks:
+        click.echo(f"warning: {remark}", err=True)
+    text = calibration.magnetometer_parameters(found, bag)
+    if out is None:
+        click.echo(text)
+    else:
+        Path(out).write_text(text)
 
 
 @cli.command(cls=_ListingCommand, listing=("Demos", DEMOS))
@@ -383,6 +416,28 @@ def translate(file: str, out: str | None) -> None:
 
 
 @cli.command()
+@click.argument("table", type=click.Path())
+@click.option("--measuring-error", type=click.FloatRange(min=0.0), default=0.0, metavar="M",
+              help="Most that a measured length may be off, for the bound of the RMS.")
+def lengths(table: str, measuring_error: float) -> None:
+    """Compare smoothed jumps with measured lengths.
+
+    TABLE is a CSV file with the columns recording (an OUT of process or pipeline, relative to
+    TABLE) and measured (m).
+    """
+    from imu_fusion.evaluation.jump_length import JumpLengths
+    from imu_fusion.recordings.jump_table import read_lengths
+    jumps = JumpLengths(*read_lengths(table))
+    shown = Table("recording", "estimated m", "σ m", "measured m", "error m")
+    for row in zip(jumps.names, jumps.estimated, jumps.sd, jumps.measured, jumps.error):
+        shown.add_row(row[0], *(f"{value:.2f}" for value in row[1:4]), f"{row[4]:+.2f}")
+    console.print(shown)
+    click.echo(f"{len(jumps.names)} jumps: RMS {jumps.rms():.2f} m"
+               + (f", at most {jumps.rms(measuring_error):.2f} m where measured lengths are off by "
+                  f"up to {measuring_error:g} m" if measuring_error else ""))
+
+
+@cli.command()
 def compile() -> None:
     """Compile the kernels for this machine now, so that no node does when it starts."""
     from imu_fusion.compile_ahead import compile_ahead
@@ -391,7 +446,11 @@ def compile() -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    cli(prog_name="imu_fusion")
+    try:
+        with handled(interrupt):
+            cli(prog_name="imu_fusion")
+    except Interrupted as signal:
+        sys.exit(signal.code)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import numpy as np
 
 from imu_fusion import kernels
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.signals import held
 
 _STEP = 10_000_000     # ns
 _SAMPLES = 400
@@ -124,16 +125,19 @@ def compile_ahead(say: Callable[[str], object]) -> None:
     Raises:
         ImuFusionError: a kernel does not compile here; with the last words of the compiler.
 
-    SIGINT, and what raises an exception in the meantime, ends the processes too.
+    What raises an exception in the meantime ends the processes, too.
     """
     mark = kernels.cache_file(f"complete-{_state()}")
     if mark is None or mark.exists():
         return
     say(kernels.NOTICE)
-    processes = {job: subprocess.Popen([sys.executable, "-m", "imu_fusion.compile_ahead", job],
-                                       stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                       stderr=subprocess.STDOUT, text=True) for job in _JOBS}
+    processes: dict[str, subprocess.Popen] = {}
     try:
+        with held():
+            for job in _JOBS:
+                processes[job] = subprocess.Popen(
+                    [sys.executable, "-m", "imu_fusion.compile_ahead", job], text=True,
+                    stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         for job, process in processes.items():
             said, _ = process.communicate()
             if process.returncode:

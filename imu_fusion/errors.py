@@ -4,6 +4,9 @@ Each message names the file, topic, parameter or stamp, says what was wrong and
 what to do. The command line prints the message without a traceback.
 """
 
+INCOMPLETE = 3
+"""Exit code: finished, but something was lost."""
+
 
 class ImuFusionError(Exception):
     """Root of all errors that this package raises on purpose."""
@@ -37,5 +40,13 @@ class LayoutError(ImuFusionError, ValueError):
     """A sensor layout or a surface definition is degenerate or inconsistent."""
 
 
+class RefusedError(ImuFusionError):
+    """A service was called that can do nothing now."""
+
+
 class EstimationError(ImuFusionError):
     """An estimator cannot produce a meaningful result from what it was given."""
+
+
+class DeviceError(ImuFusionError):
+    """A device cannot be reached, or does not answer as it should."""

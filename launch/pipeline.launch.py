@@ -30,7 +30,7 @@ def start(context):
         return Node(package="imu_fusion", executable=name, name=name, output="screen",
                     parameters=[given.params_file, parameters])
 
-    recorder = node("recorder", out=given.out, end_with_sources=True,
+    recorder = node("recorder", out=given.out, whole=True, end_with_sources=True,
                     expected_sources=[SMOOTHER])
     # ROS has no empty lists: what is empty is left to its default.
     replay = {name: list(value) if isinstance(value, tuple) else value

@@ -17,7 +17,8 @@ from imu_fusion.demos import DEMOS
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.nodes import NODES
 from imu_fusion.parameters.file import load, parameters_for
-from imu_fusion.recordings.csv_import import import_csv
+from imu_fusion.recordings.convert import convert
+from imu_fusion.sources.description import Description
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.surfaces.file import surface_from_mapping
 
@@ -356,6 +357,8 @@ class Checker:
                     surface_from_mapping(content)
             elif "accelerometers" in content:
                 _import_zeros(content, path)
+            elif "time" in content:
+                Description.from_mapping(content, path.name)
             else:
                 self.complain("a YAML block of no known kind")
         except ImuFusionError as error:
@@ -403,4 +406,4 @@ def _import_zeros(description, path):
     table = path.with_suffix(".csv")
     table.write_text("\n".join(",".join([str(row)] + ["0"] * (len(columns) - 1)) if row else
                                ",".join(columns) for row in range(4)))
-    import_csv(table, path, path.with_name("table"), overwrite=True)
+    convert(table, path.with_name("table"), path, overwrite=True)

@@ -27,10 +27,7 @@ TEXT = "\n".join(PAGES.values())
 
 def node_class(name):
     """The class of a node by the name of its executable."""
-    module = importlib.import_module(f"imu_fusion.nodes.{name}")
-    found, = (value for value in vars(module).values() if isinstance(value, type)
-              and issubclass(value, Node) and value.__module__ == module.__name__)
-    return found
+    return getattr(importlib.import_module(f"imu_fusion.nodes.{name}"), NODES[name].node)
 
 
 def help_of(command):
@@ -43,14 +40,14 @@ def help_of(command):
 @pytest.mark.parametrize("name", NODES)
 def test_an_executable_is_a_node_of_that_name_which_says_what_it_does(name):
     cls = node_class(name)
-    assert name == cls.NAME and callable(importlib.import_module(cls.__module__).main)
+    assert name == cls.NAME and issubclass(cls, Node)
     assert cls.__doc__.splitlines()[0] == NODES[name].summary
     assert f"{name} {NODES[name].summary}" in help_of("run")
 
 
 def test_every_node_is_an_executable():
     for path in (ROOT / "imu_fusion" / "nodes").glob("*.py"):
-        if "\ndef main(" in path.read_text():
+        if "\n    NAME = " in path.read_text():
             assert path.stem in NODES
 
 
@@ -61,7 +58,7 @@ def test_setup_installs_these_executables_and_this_version(monkeypatch):
     runpy.run_path("setup.py")
     assert given["entry_points"]["console_scripts"] == [
         "imu_fusion = imu_fusion.cli:main",
-        *(f"{name} = imu_fusion.nodes.{name}:main" for name in NODES)]
+        *(f"{name} = imu_fusion.nodes:main" for name in NODES)]
     root = xml.etree.ElementTree.parse(ROOT / "package.xml").getroot()
     assert given["version"] == imu_fusion.__version__ == root.findtext("version")
 

@@ -25,7 +25,7 @@ def replay_and_smooth(bag: Path, out: Path, params_file: Path, console: Console)
     with open_bag(recording) as reader:
         duration = (read_log(reader, "imu/data_raw").stamp[[0, -1]] * [-1, 1]).sum() * 1e-9
         recorded = read_log(reader, SMOOTHED_FIX_TOPIC)
-    smoothed = write_recording_report(bag, None, report, params_file)
+    smoothed = write_recording_report(bag, None, report, params_file).smoothed
     if smoothed is None:
         raise EstimationError(f"{bag}: the nodes have smoothed it, the report has not")
     samples, frame = smoothed.result.samples, smoothed.result.frame

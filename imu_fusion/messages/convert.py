@@ -17,7 +17,9 @@ import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
 
 from imu_fusion.errors import TopicError
-from imu_fusion.geometry.rotation_arrays import rotation_matrices, rpy_angles
+from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.geometry.rotation_arrays import rpy_angles
+from imu_fusion.kernels import njit
 from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
 from imu_fusion.samples import AttitudeLog, FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 from imu_fusion.samples.logs import Log
@@ -26,6 +28,11 @@ UNKNOWN = np.zeros((3, 3))
 ABSENT = np.zeros((3, 3))
 ABSENT[0, 0] = -1.0
 _COVARIANCE_KNOWN = 3
+
+# Columns of a decoded Imu: what is measured, and the first elements of its covariances.
+_MEASURED = np.r_[IMU["angular_velocity"], IMU["linear_acceleration"]]
+_ABSENT = np.array([IMU[f"{field}_covariance"].start
+                    for field in ("angular_velocity", "linear_acceleration")])
 
 
 def imu_message(stamp: int, frame_id: str, gyr: ArrayLike | None, acc: ArrayLike | None,
@@ -94,25 +101,38 @@ def pose_message(stamp: int, frame_id: str, quat_world_imu: Sequence[float] | np
 
 
 def imu_messages(stamp: np.ndarray, frame_id: str, gyr: np.ndarray, cov_gyr: np.ndarray,
-                 acc: np.ndarray, cov_acc: np.ndarray, quat: np.ndarray,
-                 cov_orientation: np.ndarray, has_force: np.ndarray) -> list[bytes]:
-    """CDR bytes of n sensor_msgs/Imu, as :func:`imu_message` makes them one by one.
+                 acc: np.ndarray, cov_acc: np.ndarray, quat: np.ndarray, cov_attitude: np.ndarray,
+                 has_force: np.ndarray) -> list[bytes]:
+    """CDR bytes of n sensor_msgs/Imu with estimates.
 
     Args:
         stamp: (n,) int64 ns. frame_id: of all of them.
-        gyr, acc: (n, 3); quat: (n, 4); the covariances: (n, 3, 3).
+        gyr, acc: (n, 3); quat: (n, 4); the covariances: (n, 3, 3), that of the attitude about the
+            axes of the sensor: it is written about those of the world.
         has_force: (n,) bool, whether acc is there; where not it is marked as absent.
     """
     values = np.zeros((len(stamp), IMU.size))
-    for field, value, cov in (("orientation", quat, cov_orientation),
-                              ("angular_velocity", gyr, cov_gyr),
-                              ("linear_acceleration", acc, cov_acc)):
-        values[:, IMU[field]] = value
-        values[:, IMU[field + "_covariance"]] = np.reshape(cov, (-1, 9))
-    absent = ~has_force
-    values[absent, IMU["linear_acceleration"]] = 0.0
-    values[absent, IMU["linear_acceleration_covariance"]] = ABSENT.ravel()
+    _fill_imu(values, gyr, cov_gyr, acc, cov_acc, quat, cov_attitude, has_force)
     return IMU.encode_block(stamp, frame_id, values)
+
+
+@njit
+def _fill_imu(values, gyr, cov_gyr, acc, cov_acc, quat, cov_attitude, has_force):
+    for k in range(len(values)):
+        row = values[k]
+        row[:4] = quat[k]
+        turn = quat_to_matrix(quat[k])
+        for i in range(3):
+            row[13 + i] = gyr[k, i]
+            row[25 + i] = acc[k, i] if has_force[k] else 0.0
+            for j in range(3):
+                row[16 + 3 * i + j] = cov_gyr[k, i, j]
+                row[28 + 3 * i + j] = cov_acc[k, i, j] if has_force[k] else 0.0
+                for m in range(3):
+                    for n in range(3):
+                        row[4 + 3 * i + j] += turn[i, m] * cov_attitude[k, m, n] * turn[j, n]
+        if not has_force[k]:
+            row[28] = -1.0
 
 
 def orientation_messages(rows: np.ndarray, frame_id: str, has_force: np.ndarray) -> list[bytes]:
@@ -120,10 +140,8 @@ def orientation_messages(rows: np.ndarray, frame_id: str, has_force: np.ndarray)
 
     has_force: (n,) bool, whether the sensor measures specific force; where not it is absent.
     """
-    rotation = rotation_matrices(rows["quat_world_imu"])
-    cov = rotation @ rows["cov_attitude"] @ rotation.transpose(0, 2, 1)
     return imu_messages(rows["stamp"], frame_id, rows["gyr"], rows["cov_gyr"], rows["acc"],
-                        rows["cov_acc"], rows["quat_world_imu"], cov, has_force)
+                        rows["cov_acc"], rows["quat_world_imu"], rows["cov_attitude"], has_force)
 
 
 def rpy_messages(rows: np.ndarray, frame_id: str) -> list[bytes]:
@@ -155,19 +173,19 @@ def string_value(cdr: bytes) -> str:
 
 def imu_values(values: np.ndarray) -> np.ndarray:
     """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
-    result = np.concatenate([values[..., IMU["angular_velocity"]],
-                             values[..., IMU["linear_acceleration"]]], axis=-1)
-    for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_acceleration")):
-        absent = values[..., IMU[field + "_covariance"].start] == -1.0
-        result[..., part][absent] = np.nan
+    result = values[..., _MEASURED]
+    absent = values[..., _ABSENT] == -1.0
+    if absent.any():
+        result[np.repeat(absent, 3, axis=-1)] = np.nan
     return result
 
 
 def gyroscope_first_values(values: np.ndarray) -> np.ndarray:
     """As imu_values, but specific force is zero where absent: a gyroscope alone is enough."""
     result = imu_values(values)
-    absent = values[..., IMU["linear_acceleration_covariance"].start] == -1.0
-    result[..., 3:][absent] = 0.0
+    absent = values[..., _ABSENT[1]] == -1.0
+    if absent.any():
+        result[absent, 3:] = 0.0
     return result
 
 

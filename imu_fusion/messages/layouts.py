@@ -1,17 +1,16 @@
 """CDR bytes of the messages that carry samples and estimates, without ROS.
 
-A :class:`Layout` describes a message that is a ``std_msgs/Header`` followed by
-numbers. Decoding such bytes costs about a microsecond; live nodes and batch use
-the same code, so that both write the same bytes.
+A :class:`Layout` describes a message that is a ``std_msgs/Header`` followed by numbers. Messages
+whose strings are alike have their numbers at the same places: one record of numpy reads or writes
+one or thousands of them. Live nodes and batch use the same code, so that both write the same bytes.
 
-Only plain CDR (little or big endian) occurs in ROS 2 bags and on the wire of
-the default middleware; anything else is refused.
+Only plain CDR (little or big endian) occurs in ROS 2 bags and on the wire of the default
+middleware; anything else is refused.
 """
 
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -19,10 +18,9 @@ from imu_fusion.errors import MessageError
 
 NANOSECONDS = 1_000_000_000
 _LITTLE = b"\x00\x01\x00\x00"
-
-
-_FEW = 8              # messages that are decoded or encoded faster one by one
-_FRAMES_AT_ONCE = 8   # different frame ids of one length that are looked for
+_STAMP = struct.Struct("<iI")
+_STRINGS = 12    # where they begin: behind encapsulation and stamp
+_KNOWN = 64      # shapes and templates that are kept: strings come from outside
 
 
 @dataclass(frozen=True)
@@ -37,6 +35,24 @@ class Decoded:
     frame_ids: list
     values: np.ndarray
     refused: dict
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """Where the numbers are in messages of one size, byte order and strings."""
+
+    size: int
+    order: bytes      # the two bytes that tell it
+    strings: bytes
+    end: int          # of the strings
+    frame_id: str
+    stamp: struct.Struct
+    record: np.dtype
+
+    def fits(self, cdr: bytes) -> bool:
+        """Whether a message is one of these."""
+        return (len(cdr) == self.size and cdr[_STRINGS:self.end] == self.strings
+                and cdr[:2] == self.order)
 
 
 class Layout:
@@ -56,17 +72,20 @@ class Layout:
                  **doubles: int):
         self.msgtype = msgtype
         self.child = child
-        self._before, self._after = before, after
-        self._count = sum(doubles.values())
         self._slices: dict[str, slice] = {}
         position = len(before)
         for name, count in doubles.items():
             self._slices[name] = slice(position, position + count)
             position += count
         self.size = position + len(after)
-        self._prefixes: dict[tuple[str, str], bytes] = {}
-        self._records: dict[tuple[str, int, int], np.dtype] = {}
-        self._rest = {order: struct.Struct(f"{order}{self._count}d{after}") for order in "<>"}
+        # Fields of a record, their codes and shapes, and the columns of the values that they are.
+        self._fields: list[tuple[str, str, tuple, int | slice]] = [
+            *((f"before{k}", code, (), k) for k, code in enumerate(before)),
+            ("doubles", "d", (position - len(before),), slice(len(before), position)),
+            *((f"after{k}", code, (), position + k) for k, code in enumerate(after))]
+        self._latest: _Shape | None = None
+        self._shapes: dict[tuple[int, bytes, bytes], _Shape] = {}
+        self._templates: dict[tuple[str, str], tuple[bytes, np.dtype]] = {}
 
     def __getitem__(self, field: str) -> slice:
         return self._slices[field]
@@ -83,25 +102,8 @@ class Layout:
         Raises:
             MessageError: the bytes are not one message of this type.
         """
-        try:
-            order = self._order(cdr)
-            sec, nanosec, length = struct.unpack_from(order + "iII", cdr, 4)
-            end = 16 + length
-            if length < 1 or end > len(cdr) or nanosec >= NANOSECONDS:
-                raise MessageError(f"{self.msgtype}: header with a frame id of {length} bytes and "
-                                   f"{nanosec} ns in a message of {len(cdr)} bytes")
-            frame_id = bytes(cdr[16:end - 1]).decode("utf-8", "replace")
-            end = self._end_of_strings(order, cdr)
-            values: tuple = ()
-            for code in self._before:
-                size = struct.calcsize(code)
-                end = 4 + _align(end - 4, size)
-                values += struct.unpack_from(order + code, cdr, end)
-                end += size
-            values += self._rest[order].unpack_from(cdr, 4 + _align(end - 4, 8))
-        except (struct.error, IndexError) as error:
-            raise MessageError(f"{self.msgtype}: {len(cdr)} bytes are too few ({error})") from None
-        return sec * NANOSECONDS + nanosec, frame_id, np.array(values, dtype=np.float64)
+        stamp, frame_ids, values = self.decode_many([cdr])
+        return int(stamp[0]), frame_ids[0], values[0]
 
     def decode_many(self, messages: Sequence[bytes]
                     ) -> tuple[np.ndarray, list[str], np.ndarray]:
@@ -123,88 +125,34 @@ class Layout:
 
         Args:
             messages: sequence of bytes-like objects.
-
-        Returns:
-            Decoded, each number equal to that of :meth:`decode`.
         """
-        n = len(messages)
-        block = Decoded(np.zeros(n, np.int64), [""] * n, np.zeros((n, self.size)), {})
-        alike: dict[tuple[int, bytes, bytes], list[int]] = {}
+        stamp: list[int] = []
+        frame_ids: list[str] = []
+        refused: dict[int, str] = {}
+        alike: dict[_Shape, tuple[list[int], list[bytes]]] = {}
         for i, cdr in enumerate(messages):
-            alike.setdefault((len(cdr), bytes(cdr[:4]), bytes(cdr[12:16])), []).append(i)
-        for indices in alike.values():
-            rest = np.array(indices)
-            for _ in range(_FRAMES_AT_ONCE):
-                if len(rest) < _FEW:
-                    break
-                rest = self._decode_alike(messages, rest, block)
-            for i in rest.tolist():
-                try:
-                    block.stamp[i], block.frame_ids[i], block.values[i] = self.decode(messages[i])
-                except MessageError as error:
-                    block.refused[i] = str(error)
-        if block.refused:
-            keep = [i for i in range(n) if i not in block.refused]
-            block = Decoded(block.stamp[keep], [block.frame_ids[i] for i in keep],
-                            block.values[keep], dict(sorted(block.refused.items())))
-        return block
-
-    def _decode_alike(self, messages: Sequence[bytes], indices: np.ndarray,
-                      block: Decoded) -> np.ndarray:
-        """Decode the messages whose strings are those of the first; return the other indices."""
-        first = messages[indices[0]]
-        try:
-            _, frame_id, _ = self.decode(first)
-        except MessageError as error:
-            block.refused[int(indices[0])] = str(error)
-            return indices[1:]
-        size = len(first)
-        rows = np.frombuffer(b"".join([messages[i] for i in indices]), np.uint8).reshape(-1, size)
-        order = self._order(first)
-        end = self._end_of_strings(order, first)
-        same = (rows[:, 12:end] == rows[0, 12:end]).all(axis=1)
-        record = self._record(order, end, size)
-        chosen = rows[same].view(record)[:, 0]
-        here = indices[same]
-        wild = chosen["nanosec"] >= NANOSECONDS
-        for i in here[wild].tolist():
             try:
-                self.decode(messages[i])
+                shape = self._latest
+                if shape is None or not shape.fits(cdr):
+                    shape = self._latest = self._shape(bytes(cdr))
+                sec, nanosec = shape.stamp.unpack_from(cdr, 4)
+                if nanosec >= NANOSECONDS:
+                    raise MessageError(f"{self.msgtype}: a stamp with {nanosec} ns")
             except MessageError as error:
-                block.refused[i] = str(error)
-        block.stamp[here] = chosen["sec"].astype(np.int64) * NANOSECONDS + chosen["nanosec"]
-        for i in here.tolist():
-            block.frame_ids[i] = frame_id
-        for k in range(len(self._before)):
-            block.values[here, k] = chosen[f"before{k}"]
-        last = len(self._before) + self._count
-        block.values[here, len(self._before):last] = chosen["doubles"]
-        for k in range(len(self._after)):
-            block.values[here, last + k] = chosen[f"after{k}"]
-        return indices[~same]
-
-    def encode_block(self, stamp: np.ndarray, frame_id: str, values: np.ndarray,
-                     child_frame_id: str = "") -> list[bytes]:
-        """:meth:`encode` of n messages: stamp (n,) int64, values (n, size). Returns a list of
-        bytes."""
-        n = len(stamp)
-        if n < _FEW:
-            return [self.encode(s, frame_id, v, child_frame_id)
-                    for s, v in zip(stamp.tolist(), values)]
-        template = self.encode(0, frame_id, np.zeros(self.size), child_frame_id)
-        size = len(template)
-        record = self._record("<", self._end_of_strings("<", template), size)
-        rows = np.tile(np.frombuffer(template, np.uint8), (n, 1))
-        out = rows.view(record)[:, 0]
-        out["sec"], out["nanosec"] = np.divmod(stamp, NANOSECONDS)
-        for k in range(len(self._before)):
-            out[f"before{k}"] = values[:, k]
-        last = len(self._before) + self._count
-        out["doubles"] = values[:, len(self._before):last]
-        for k in range(len(self._after)):
-            out[f"after{k}"] = values[:, last + k]
-        data = rows.tobytes()
-        return [data[i:i + size] for i in range(0, n * size, size)]
+                refused[i] = str(error)
+                continue
+            places, chosen = alike.setdefault(shape, ([], []))
+            places.append(len(stamp))
+            chosen.append(cdr)
+            stamp.append(sec * NANOSECONDS + nanosec)
+            frame_ids.append(shape.frame_id)
+        values = np.empty((len(stamp), self.size))
+        for shape, (places, chosen) in alike.items():
+            rows = np.frombuffer(b"".join(chosen), shape.record)
+            here = slice(None) if len(alike) == 1 else places
+            for name, _, _, column in self._fields:
+                values[here, column] = rows[name]
+        return Decoded(np.array(stamp, np.int64), frame_ids, values, refused)
 
     def encode(self, stamp: int, frame_id: str, values: Sequence[float] | np.ndarray,
                child_frame_id: str = "") -> bytes:
@@ -215,68 +163,80 @@ class Layout:
             frame_id: str.
             values: sequence of ``size`` numbers, in the order of :meth:`decode`.
         """
+        return self.encode_block(np.array([stamp], np.int64), frame_id,
+                                 np.asarray(values, dtype=float)[None], child_frame_id)[0]
+
+    def encode_block(self, stamp: np.ndarray, frame_id: str, values: np.ndarray,
+                     child_frame_id: str = "") -> list[bytes]:
+        """:meth:`encode` of n messages: stamp (n,) int64, values (n, size). Returns a list of
+        bytes."""
         key = (frame_id, child_frame_id)
-        prefix = self._prefixes.get(key)
-        if prefix is None:
-            prefix = _string(frame_id)
-            if self.child:
-                prefix = _pad(prefix, 4) + _string(child_frame_id)
-            if len(self._prefixes) < 64:  # frame ids come from outside
-                self._prefixes[key] = prefix
-        sec, nanosec = divmod(int(stamp), NANOSECONDS)
-        body = struct.pack("<iI", sec, nanosec) + prefix
-        for code, value in zip(self._before, values):
-            body = _pad(body, struct.calcsize(code)) + struct.pack("<" + code, int(value))
-        first = len(self._before)
-        last = first + self._count
-        body = _pad(body, 8) + np.asarray(values[first:last], dtype="<f8").tobytes()
-        for code, value in zip(self._after, values[last:]):
-            body = _pad(body, struct.calcsize(code)) + struct.pack("<" + code, int(value))
-        return _LITTLE + body
+        template, record = self._templates.get(key) or self._template(*key)
+        room = bytearray(template * len(stamp))
+        rows = np.frombuffer(room, record)
+        for i, nanoseconds in enumerate(stamp.tolist()):
+            _STAMP.pack_into(room, i * len(template) + 4, *divmod(nanoseconds, NANOSECONDS))
+        for name, _, _, column in self._fields:
+            rows[name] = values[:, column]
+        data, size = bytes(room), len(template)
+        return [data[i:i + size] for i in range(0, len(data), size)]
 
-    def _end_of_strings(self, order: str, cdr: bytes) -> int:
-        """Where the numbers may begin."""
-        end = 16 + struct.unpack_from(order + "I", cdr, 12)[0]
+    def _template(self, frame_id: str, child_frame_id: str) -> tuple[bytes, np.dtype]:
+        """A message of zeros, and where its numbers are."""
+        strings = _string(frame_id)
         if self.child:
-            start = 4 + _align(end - 4, 4)
-            end = start + 4 + struct.unpack_from(order + "I", cdr, start)[0]
-        return end
+            strings = _pad(strings, 4) + _string(child_frame_id)
+        begin = _LITTLE + bytes(_STRINGS - 4) + strings
+        record = self._record("<", len(begin))
+        made = begin.ljust(record.itemsize, b"\0"), record
+        if len(self._templates) < _KNOWN:
+            self._templates[frame_id, child_frame_id] = made
+        return made
 
-    def _record(self, order: str, end: int, size: int) -> np.dtype:
-        """The structured dtype of a message of ``size`` bytes whose strings end at ``end``."""
-        record = self._records.get((order, end, size))
-        if record is not None:
-            return record
-        fields: dict[str, tuple[Any, int]] = {
-            "sec": (order + "i4", 4), "nanosec": (order + "u4", 8)}
-        for part, codes in (("before", self._before), ("doubles", ""), ("after", self._after)):
-            if part == "doubles":
-                end = 4 + _align(end - 4, 8)
-                fields[part] = ((order + "f8", (self._count,)), end)
-                end += 8 * self._count
-            for k, code in enumerate(codes):
-                width = struct.calcsize(code)
-                end = 4 + _align(end - 4, width)
-                fields[f"{part}{k}"] = (order + np.dtype(code).str[1:], end)
-                end += width
-        record = np.dtype({"names": list(fields), "formats": [f for f, _ in fields.values()],
-                           "offsets": [o for _, o in fields.values()], "itemsize": size})
-        if len(self._records) < 64:  # lengths come from outside
-            self._records[order, end, size] = record
-        return record
-
-    def _order(self, cdr):
+    def _shape(self, cdr: bytes) -> _Shape:
+        """The shape of a message, or MessageError."""
         if len(cdr) < 16 or cdr[0] != 0 or cdr[1] not in (0, 1):
             raise MessageError(f"{self.msgtype}: {len(cdr)} bytes that do not start as plain CDR")
-        return "<" if cdr[1] == 1 else ">"
+        order = "<" if cdr[1] == 1 else ">"
+        end = first = 16 + struct.unpack_from(order + "I", cdr, _STRINGS)[0]
+        if end == 16 or end > len(cdr):
+            raise MessageError(f"{self.msgtype}: a frame id of {end - 16} bytes in a message of "
+                               f"{len(cdr)} bytes")
+        if self.child and _aligned(end, 4) + 4 <= len(cdr):
+            start = _aligned(end, 4)
+            end = start + 4 + struct.unpack_from(order + "I", cdr, start)[0]
+        key = (len(cdr), cdr[:2], cdr[_STRINGS:end])
+        shape = self._shapes.get(key)
+        if shape is None:
+            record = self._record(order, end, len(cdr))
+            shape = _Shape(*key, end, cdr[16:first - 1].decode("utf-8", "replace"),
+                           struct.Struct(order + "iI"), record)
+            if len(self._shapes) < _KNOWN:
+                self._shapes[key] = shape
+        return shape
+
+    def _record(self, order: str, end: int, size: int | None = None) -> np.dtype:
+        """The structured dtype of a message whose strings end at ``end``, of ``size`` bytes (None:
+        as many as it needs)."""
+        fields: dict[str, tuple[np.dtype, int]] = {}
+        for name, code, shape, _ in self._fields:
+            kind = np.dtype((order + np.dtype(code).str[1:], shape))
+            end = _aligned(end, struct.calcsize(code))
+            fields[name] = kind, end
+            end += kind.itemsize
+        if size is not None and end > size:
+            raise MessageError(f"{self.msgtype}: {size} bytes are too few, {end} are needed")
+        return np.dtype({"names": list(fields), "formats": [f for f, _ in fields.values()],
+                         "offsets": [o for _, o in fields.values()], "itemsize": size or end})
 
 
-def _align(position, size):
-    return -(-position // size) * size
+def _aligned(position, size):
+    """Alignment counts from behind the encapsulation."""
+    return 4 - (4 - position) // size * size
 
 
 def _pad(data, size):
-    return data + b"\0" * (_align(len(data), size) - len(data))
+    return data + b"\0" * (-len(data) % size)
 
 
 def _string(text):

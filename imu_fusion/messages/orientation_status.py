@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_fusion.estimation.orientation import rows as st
+from imu_fusion.kernels import njit
 from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import TWIST
 
@@ -28,7 +29,8 @@ _MAG_FLAGS = st.FLAG_MAG_DISTURBED | st.FLAG_MAG_SATURATED
 _MAG_SEEN = _MAG_FLAGS | st.FLAG_MAG_USED
 
 
-def lasting_flags(flags: np.ndarray, before: int) -> np.ndarray:
+@njit
+def lasting_flags(flags, before):
     """The flags of rows that are in ``WORDS``; what a magnetometer sample showed lasts until the
     next one.
 
@@ -38,10 +40,11 @@ def lasting_flags(flags: np.ndarray, before: int) -> np.ndarray:
     Returns:
         (n,) int64
     """
-    flags = np.asarray(flags, dtype=np.int64)
-    shown = np.maximum.accumulate(np.where(flags & _MAG_SEEN, np.arange(len(flags)), -1))
-    last = np.where(shown < 0, before, flags[np.maximum(shown, 0)])
-    return (flags | last & _MAG_FLAGS) & _LASTING
+    out = np.empty(len(flags), np.int64)
+    for i in range(len(flags)):
+        shown = flags[i] if flags[i] & _MAG_SEEN else before
+        out[i] = before = (flags[i] | shown & _MAG_FLAGS) & _LASTING
+    return out
 
 
 def flags_message(stamp: int, frame_id: str, flags: int) -> bytes:

@@ -1,10 +1,6 @@
 """The acceleration field estimator as a node: decode, one call, encode."""
 
-from collections.abc import Sequence
-
-from std_srvs.srv import Trigger
-
-from imu_fusion.nodes.base import run_node
+from imu_fusion.errors import RefusedError
 from imu_fusion.nodes.estimator import EstimatorNode
 from imu_fusion.streams.acceleration_field import (
     NODE,
@@ -30,31 +26,17 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
             values.update(self.params(cls).to_mapping())
         config = FieldConfiguration.from_mapping(values, f"node {self.get_name()}")
         self.attach(AccelerationFieldStream(config, self.get_logger().warning), OUTPUTS)
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/smooth", self._on_smooth)
+        self.offer("reset", self.restart)
+        self.offer("smooth", self._smooth)
 
     def summary(self) -> dict:
         return self._stream.summary()
 
-    def _on_reset(self, request, response):
-        self._stream.restart()
-        response.success = True
-        response.message = "the estimator starts anew with the next sample"
-        return response
-
-    def _on_smooth(self, request, response):
+    def _smooth(self):
         if self._stream.config.field.mode != "smoothed":
-            response.message = "mode is causal: nothing is held back; start with mode:=smoothed"
-            return response
+            raise RefusedError("mode is causal: nothing is held back; start with mode:=smoothed")
         made = self._stream.smooth()
         self.publish(made)
-        count = len(made[0].stamp) if made else 0
-        response.success = count > 0
-        response.message = (f"{count} samples smoothed and published" if count
-                            else "no samples since the last time")
-        return response
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of the executable."""
-    return run_node(AccelerationFieldEstimatorNode, args)
+        if not made:
+            raise RefusedError("no samples since the last time")
+        return f"{len(made[0].stamp)} samples smoothed and published"

@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,13 +19,15 @@ from rcl_interfaces.msg import (
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
 
-from imu_fusion.errors import ImuFusionError, ParameterError, TopicError
+from imu_fusion.errors import INCOMPLETE, ImuFusionError, ParameterError, TopicError
 from imu_fusion.kernels import is_compiling
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
 from imu_fusion.parameters.declare import ParameterInfo, Parameters, unknown_parameter
+from imu_fusion.signals import Interrupted, exit_code, handled, interrupt
 
 P = TypeVar("P", bound=Parameters)
 
@@ -90,7 +91,7 @@ class Node(rclpy.node.Node):
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True,
                          **kwargs)
         self.finished = False
-        self.problems: list[str] = []  # texts: why the exit code is 1
+        self.problems: list[str] = []  # texts: why the exit code is INCOMPLETE
         self._params = self._declare(params_files)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -117,21 +118,34 @@ class Node(rclpy.node.Node):
         """Release files; called once, whatever happened."""
 
     def start_diagnostics(self, task: str, status: Callable[
-            [], tuple[bytes, str, Mapping[str, object]]]) -> None:
+            [], tuple[bytes, str, Mapping[str, object]]],
+            hardware: Callable[[], str] = lambda: "imu_fusion") -> None:
         """Publish ``status() -> (level, message, {key: value})`` on `/diagnostics` at 1 Hz, as
-        diagnostic_updater would: named ``node: task``, for the hardware "imu_fusion"."""
+        diagnostic_updater would: named ``node: task``, for what ``hardware()`` names."""
         publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
         def publish():
             level, message, values = status()
             array = DiagnosticArray(status=[DiagnosticStatus(
                 level=level, name=f"{self.get_fully_qualified_name().lstrip('/')}: {task}",
-                message=message, hardware_id="imu_fusion",
+                message=message, hardware_id=hardware(),
                 values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])])
             array.header.stamp = self.get_clock().now().to_msg()
             publisher.publish(array)
 
         steady_timer(self, 1.0, publish)
+
+    def offer(self, name: str, action: Callable[[], str]) -> None:
+        """Offer the service ``~/name`` (std_srvs/Trigger): it answers what ``action()`` returns, or
+        the reason why it raised an ImuFusionError."""
+        def answer(_, response):
+            try:
+                response.message, response.success = action(), True
+            except ImuFusionError as error:
+                response.message = str(error)
+            return response
+
+        self.create_service(Trigger, f"~/{name}", answer)
 
     def _declare(self, params_files):
         # rclpy has declared what was given, with the type that it was given in. Take it
@@ -191,11 +205,12 @@ class Node(rclpy.node.Node):
 def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
     """The main() of a node.
 
-    Runs until the node is finished or SIGINT, SIGTERM or a shutdown of the context
+    Runs until the node is finished or SIGINT, SIGTERM, SIGHUP or a shutdown of the context
     arrives; a second signal ends it at once.
 
     Returns:
-        Exit code: 0 after an orderly end, 1 after an error, which is printed in one line.
+        Exit code: 0 after an orderly end, INCOMPLETE if something was lost, 130, 143 or 129 after a
+        signal, 1 after an error, which is printed in one line.
     """
     arguments = sys.argv if args is None else ["", *args]
     try:
@@ -210,14 +225,22 @@ def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
     if own:
         return _complain(node_class, f"unexpected argument '{own[0]}'; parameters are given as "
                          "--ros-args -p name:=value (see --help)")
-    signals = []
+    signals: list[int] = []
 
     def take(number, frame):
         signals.append(number)
         if is_compiling():
-            raise KeyboardInterrupt    # numba would go on for a minute
+            interrupt(number)    # numba would go on for a minute
 
-    previous = {number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with handled(take):
+            code = _start(node_class, arguments, signals)
+    except Interrupted as error:
+        return error.code
+    return exit_code(signals[0]) if signals else code
+
+
+def _start(node_class, arguments, signals):
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
@@ -225,8 +248,6 @@ def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
         return _run(node_class, signals, files)
-    except KeyboardInterrupt:
-        return 0
     except ImuFusionError as error:
         return _complain(node_class, error)
     except Exception as error:
@@ -235,8 +256,6 @@ def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
         raise
     finally:
         rclpy.try_shutdown()
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def use_fast_heartbeats() -> None:
@@ -266,7 +285,7 @@ def _run(node_class, signals, params_files):
         finally:
             executor.shutdown()
             node.destroy_node()
-    return 1 if node.problems else 0
+    return INCOMPLETE if node.problems else 0
 
 
 def usage(node_class: type[Node]) -> str:

@@ -76,6 +76,11 @@ class EstimatorNode(Node):
         self._deadline = time.monotonic() + _FAREWELL
         self._flow.close()
 
+    def restart(self) -> str:
+        """The service ~/reset."""
+        self._stream.restart()
+        return "the estimator starts anew with the next sample"
+
     def summary(self) -> dict:
         """Values of the estimator for diagnostics; subclasses add theirs."""
         return {}

@@ -7,12 +7,11 @@ from typing import Any
 import yaml
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
-from std_srvs.srv import Trigger
 
-from imu_fusion.errors import ImuFusionError, ParameterError
+from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
-from imu_fusion.nodes.base import Node, run_node
+from imu_fusion.nodes.base import Node
 from imu_fusion.nodes.estimator import EstimatorNode
 from imu_fusion.streams.orientation import (
     ORIENTATION_TOPIC,
@@ -67,9 +66,9 @@ class OrientationEstimatorNode(EstimatorNode):
         warm_up(self.params(OrientationParams))
         self.attach(OrientationStream(self.params(OrientationParams), output,
                                       self.get_logger().warning), OUTPUTS)
-        for name, action in (("reset", self._restart), ("set_heading", self._set_heading),
-                             ("calibrate_magnetometer", self._calibrate)):
-            self.create_service(Trigger, f"~/{name}", self._answering(action))
+        self.offer("reset", self.restart)
+        self.offer("set_heading", self._set_heading)
+        self.offer("calibrate_magnetometer", self._calibrate)
 
     def publish(self, made: Sequence[Messages]) -> None:
         super().publish(made)
@@ -86,10 +85,6 @@ class OrientationEstimatorNode(EstimatorNode):
     def apply(self, params: Mapping[type, Any]) -> None:
         self._stream.change(params[OrientationParams])
 
-    def _restart(self):
-        self._stream.restart()
-        return "the estimator starts anew with the next sample"
-
     def _set_heading(self):
         heading = self.params(OrientationOutputParams).heading_deg
         self._stream.set_heading(math.radians(heading))
@@ -101,19 +96,3 @@ class OrientationEstimatorNode(EstimatorNode):
                 f"# coverage {100 * found.coverage:.0f} % of all directions, condition "
                 f"{found.condition:.0f}, residual {found.residual_sd * 1e6:.2f} uT; in use from "
                 "now on")
-
-    @staticmethod
-    def _answering(action):
-        """A service callback: the answer is what ``action()`` says, or the reason why not."""
-        def answer(_, response):
-            try:
-                response.message, response.success = action(), True
-            except ImuFusionError as error:
-                response.message, response.success = str(error), False
-            return response
-        return answer
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of the executable."""
-    return run_node(OrientationEstimatorNode, args)

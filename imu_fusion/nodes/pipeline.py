@@ -13,10 +13,14 @@ from imu_fusion.errors import TopicError
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inputs import find_inputs
-from imu_fusion.recordings.results import write_results
+from imu_fusion.recordings.logs import LogCollector
+from imu_fusion.recordings.losses import read_losses
+from imu_fusion.recordings.results import UNDECODABLE, left_out, write_results
 from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.samples.guard import guard_log
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
+from imu_fusion.streams.stage import Stage
 
 SMOOTHER = "smoother"
 _PATIENCE = 3600.0  # s; the nodes notice by themselves when nothing can come any more
@@ -27,14 +31,20 @@ class Plan:
     """What a pipeline does with a recording.
 
     Attributes:
-        estimators: names of the nodes that have work to do, the smoother among them.
+        inputs: of the estimators that have work to do, the smoother among them: their topics to
+            those of the recording.
         renamed: topics of the recording that are played under names of ours.
         outdated: topics of the recording with earlier estimates, which are not played.
     """
 
-    estimators: tuple[str, ...]
+    inputs: Mapping[Stage, Mapping[str, str]]
     renamed: Mapping[str, str]
     outdated: tuple[str, ...]
+
+    @property
+    def estimators(self) -> list[str]:
+        """Names of their nodes."""
+        return [stage.node for stage in self.inputs]
 
     def replay_parameters(self, bag: str | Path) -> dict:
         """Parameters of the replayer: at full speed, once all nodes have joined."""
@@ -56,7 +66,7 @@ def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
         if name not in STAGES or name == SMOOTHER:
             raise TopicError(f"no estimator '{name}' to leave out; there are: "
                              + ", ".join(node for node in STAGES if node != SMOOTHER))
-    estimators: list[str] = []
+    inputs: dict[Stage, Mapping[str, str]] = {}
     renamed: dict[str, str] = {}
     made: set[str] = set()
     with open_bag(bag) as reader:
@@ -70,11 +80,11 @@ def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
                 raise TopicError(f"nothing to smooth: {missing}")
             if missing:
                 continue
-            estimators.append(stage.node)
+            inputs[stage] = names
             made |= stage.outputs.keys()
             renamed |= {name: topic for topic, name in names.items() if name.lstrip("/") != topic}
         outdated = tuple(name for name in reader.topics if name.lstrip("/") in made)
-    return Plan(tuple(estimators), renamed, outdated)
+    return Plan(inputs, renamed, outdated)
 
 
 def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
@@ -86,7 +96,8 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     Args:
         bag: recording with what the smoother needs.
         out: rosbag2 directory to write: the recording, with old estimates left out, and the
-            new ones; results.json beside them as of ``batch.process``.
+            new ones; results.json beside them as of ``batch.process``. Where a node fails there is
+            no recording, and what ``overwrite`` was to replace stays.
         params_file: ROS 2 parameter file for all nodes, or None for defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
@@ -105,7 +116,8 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     file = Path(params_file).absolute() if params_file else None
     with NodeProcesses(logs) as nodes:
         nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
-                    overwrite=overwrite, end_with_sources=True, expected_sources=(SMOOTHER,))
+                    overwrite=overwrite, whole=True, end_with_sources=True,
+                    expected_sources=(SMOOTHER,))
         for node in plan.estimators:
             own = {"smooth_at_end": True} if node == SMOOTHER else {}
             nodes.start(node, show=show and node == SMOOTHER, params_file=file, qos="reliable",
@@ -116,5 +128,25 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         domain = nodes.domain
     with open_bag(out) as reader:
         found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
-    write_results(out, {SMOOTHER: found[-1]} if found else {})
+        losses = read_losses(reader)
+    write_results(out, ({SMOOTHER: found[-1]} if found else {})
+                  | left_out(*_left_out(bag, plan, losses)))
     return domain
+
+
+def _left_out(bag, plan, losses):
+    """What the guards of the nodes have refused, by node, and what was lost, in words."""
+    refused = {}
+    with open_bag(bag) as reader:
+        for stage, names in plan.inputs.items():
+            found = {}
+            for topic, name in names.items():
+                collector = LogCollector(stage.inputs[topic])
+                for *_, cdr in reader.messages([name]):
+                    collector.add(cdr)
+                guard = guard_log(collector.log(), stage.has_clock(topic))[2]
+                undecodable = sum(collector.refused.values())
+                found[topic] = guard.refused() | (
+                    {UNDECODABLE: undecodable} if undecodable else {})
+            refused[stage.node] = {topic: why for topic, why in found.items() if why}
+        return refused, [*(reader.warnings if reader.damaged else ()), *losses]

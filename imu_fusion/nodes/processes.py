@@ -1,5 +1,6 @@
 """Our nodes as processes of an own ROS domain: for demo, pipeline and benchmarks."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -12,8 +13,11 @@ from pathlib import Path
 import yaml
 
 from imu_fusion.compile_ahead import compile_ahead
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.kernels import NOTICE
+from imu_fusion.signals import held
+
+_PATIENCE = 15.0  # s, in which nodes end their sessions and files
 
 
 class NodeError(ImuFusionError):
@@ -66,14 +70,16 @@ class NodeProcesses:
         return self
 
     def __exit__(self, *_):
-        for process in self._processes.values():
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + 15.0
-        for process in self._processes.values():
-            try:
-                process.wait(max(0.1, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
+        try:
+            for process in self._processes.values():
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+            deadline = time.monotonic() + _PATIENCE
+            for process in self._processes.values():
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(0.1, deadline - time.monotonic()))
+        finally:    # a second signal does not wait
+            for process in self._processes.values():
                 process.kill()
                 process.wait()
 
@@ -98,14 +104,14 @@ class NodeProcesses:
             command += ["--params-file", str(own)]
         environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain),
                            ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", PYTHONUNBUFFERED="1")
-        with open(self._logs / f"{node}.log", "w") as log:
+        with open(self._logs / f"{node}.log", "w") as log, held():
             self._processes[node] = subprocess.Popen(
                 command, env=environment, stdin=subprocess.DEVNULL,
                 stdout=None if show else log, stderr=None if show else subprocess.STDOUT,
                 start_new_session=True)
 
     def wait(self, node: str, timeout: float) -> None:
-        """Wait until a node has ended by itself; seconds.
+        """Wait until a node has ended by itself, whether or not something was lost; seconds.
 
         Raises:
             NodeError: this or another node failed, or it took too long; with its last words.
@@ -114,14 +120,14 @@ class NodeProcesses:
         while self._processes[node].poll() is None:
             self._announce_compiling()
             for name, process in self._processes.items():
-                if process.poll():
+                if process.poll() not in (None, 0, INCOMPLETE):
                     raise NodeError(f"node {name} ended with code {process.returncode}: "
                                      f"{self._last_words(name)}")
             if time.monotonic() > deadline:
                 raise NodeError(f"node {node} has not ended after {timeout:g} s: "
                                  f"{self._last_words(node)}")
             time.sleep(0.05)
-        if self._processes[node].returncode:
+        if self._processes[node].returncode not in (0, INCOMPLETE):
             raise NodeError(f"node {node} ended with code {self._processes[node].returncode}: "
                              f"{self._last_words(node)}")
 

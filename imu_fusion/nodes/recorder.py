@@ -10,7 +10,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
-from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
+from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import DEPTH, NEXT, Flow, steady_timer
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.bag_writer import BagWriter
@@ -32,6 +32,9 @@ class RecorderParams(Parameters):
     chunk_size: int = param(256 * 1024, doc="size of a chunk: what a crash can lose", unit="bytes",
                             low=1024, high=2**28)
     overwrite: bool = param(False, doc="replace a recording that is there already")
+    whole: bool = param(
+        False, doc="let the recording appear when its sources have ended, or, if the recorder is "
+        "ended before, not at all")
     end_with_sources: bool = param(
         True, doc="close when all sources of recorded topics have said that they ended")
     expected_sources: tuple[str, ...] = param(
@@ -76,12 +79,12 @@ class Recorder(Node):
         self._named = {self.resolve_topic_name(topic) for topic in p.topics}
         self._regex = _compile("regex", p.regex) if p.regex is not None else None
         self._excluded = [_compile("exclude", pattern) for pattern in p.exclude]
-        self._skipped = set()
+        self._skipped, self._unclear = set(), set()
         self._expected = {f"/{name.lstrip('/')}" for name in p.expected_sources}
         self._sim_time = self.get_parameter("use_sim_time").value
         self._writer = BagWriter(p.out, compression=p.compression, chunk_size=p.chunk_size,
-                                 overwrite=p.overwrite)
-        self._failed = False
+                                 overwrite=p.overwrite, whole=p.whole)
+        self._is_wanted = not p.whole
         # Under use_sim_time nothing is asked for before there is a time to record it at.
         self._flow = Flow(self, on_begin=self._on_begin,
                           hold=lambda: self._sim_time and not self._now())
@@ -104,13 +107,13 @@ class Recorder(Node):
                 self._expected.discard(session.source)
         if (self._p.end_with_sources and self._has_ended and not self._expected
                 and not self._flow.sink.feeding() and not self._flow.sink.promised()):
-            self.finished = True
+            self.finished = self._is_wanted = True
         return self._flow.pause(IDLE)
 
     def close(self) -> None:
         """Close the recording and say what is in it."""
         self._flow.close()
-        if self._failed:
+        if not self._is_wanted:
             self._writer.abandon()
             return
         recorded = dict(self._writer.counts)
@@ -151,9 +154,13 @@ class Recorder(Node):
     def _subscribe(self, topic, msgtypes):
         if topic in self._inputs or topic in self._skipped or not self._selects(topic):
             return
+        if len(msgtypes) > 1:    # somebody is mistaken, and may see it
+            if topic not in self._unclear:
+                self._unclear.add(topic)
+                self.get_logger().warning(f"{topic} is not recorded while it has several types: "
+                                          + ", ".join(msgtypes))
+            return
         try:
-            if len(msgtypes) > 1:
-                raise TopicError(f"topic {topic} has several types: {', '.join(msgtypes)}")
             msgtype, = msgtypes
             cls = message_class(msgtype)
             infos = self.get_publishers_info_by_topic(topic)
@@ -179,7 +186,7 @@ class Recorder(Node):
                 self._writer.write(topic, msgtype, cdr, received,
                                    info["source_timestamp"] or received)
         except BagError:
-            self._failed = True
+            self._is_wanted = False
             raise
 
 
@@ -196,8 +203,3 @@ def _compile(name, pattern):
     except re.error as error:
         raise ParameterError(f"parameter '{name}' of node recorder: '{pattern}' is not a regular "
                              f"expression ({error})") from None
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run_node(Recorder, args)

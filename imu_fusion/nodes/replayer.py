@@ -4,7 +4,7 @@ import fnmatch
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import cast
 
@@ -12,10 +12,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import Trigger
 
-from imu_fusion.errors import ParameterError, TopicError
-from imu_fusion.nodes.base import Node, message_class, run_node
+from imu_fusion.errors import ParameterError, RefusedError, TopicError
+from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import DEPTH, END, NEXT, Flow, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress
 from imu_fusion.parameters.declare import Parameters, param
@@ -101,9 +100,9 @@ class Replayer(Node):
         self._anchor = None  # (monotonic time, log time) from which the pace counts
         self._told, self._told_at = "", 0
         self._progress = Progress("replaying", (self._stop - self._start) * 1e-9)
-        self.create_service(Trigger, "~/pause", self._on_pause)
-        self.create_service(Trigger, "~/resume", self._on_resume)
-        self.create_service(Trigger, "~/step", self._on_step)
+        self.offer("pause", self._pause)
+        self.offer("resume", self._resume)
+        self.offer("step", self._step)
         steady_timer(self, 1.0, self._tell)
         self.start_diagnostics("replay", lambda: (b"\0", self._phase.__name__.strip("_"), {
             publisher.topic: publisher.sent for publisher in self._outputs.values()}))
@@ -143,6 +142,8 @@ class Replayer(Node):
     def close(self) -> None:
         """Close the recording and say what was sent to whom."""
         self._progress.close()
+        if self._bag.damaged:
+            self.problems.append("a part of the recording is lost")
         self._bag.close()
         self._flow.close()
         for topic, (sent, lost) in sorted(self._source.report().items()):
@@ -294,7 +295,11 @@ class Replayer(Node):
                              "see wait_for_subscribers, wait_for_nodes and wait_timeout")
 
     def _tell(self):
-        """Say, once each, what has held the replay up since the last look, or slows it down."""
+        """Say, once each, what has held the replay up since the last look, or slows it down. Whom
+        all have left has nobody to play to."""
+        if self._phase == self._play and self.problems and not self._subscribers():
+            self.get_logger().error("nobody is left to play to")
+            self.stop()
         p = self.params(ReplayerParams)
         sent = sum(publisher.sent for publisher in self._outputs.values())
         text = ""
@@ -310,24 +315,21 @@ class Replayer(Node):
             self.get_logger().info(text)
         self._told, self._told_at = text, sent
 
-    def _on_pause(self, request, response):
+    def _pause(self):
         self._paused = True
-        response.success, response.message = True, "paused"
-        return response
+        return "paused"
 
-    def _on_resume(self, request, response):
+    def _resume(self):
         self._paused = False
-        response.success, response.message = True, "playing"
-        return response
+        return "playing"
 
-    def _on_step(self, request, response):
-        response.success = self._paused and self._next is not None
-        response.message = "one message follows"
-        if response.success:
-            self._steps += 1
-        else:
-            response.message = "not paused" if not self._paused else "nothing left to play"
-        return response
+    def _step(self):
+        if not self._paused:
+            raise RefusedError("not paused")
+        if self._next is None:
+            raise RefusedError("nothing left to play")
+        self._steps += 1
+        return "one message follows"
 
 
 def _selected(bag, p):
@@ -364,8 +366,3 @@ def _remapping(bag, rules):
                                  + ", ".join(bag.topics))
         renamed[name] = new
     return renamed
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run_node(Replayer, args)

@@ -2,10 +2,12 @@
 
 import itertools
 import multiprocessing
+import pickle
 import sys
+import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from imu_fusion.errors import EstimationError, ImuFusionError, ParameterError, T
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.transforms import TF_TYPE
-from imu_fusion.nodes.base import IDLE, Node, message_class, run_node
+from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
@@ -55,10 +57,11 @@ def _class_of(msgtype):
                              "false (imu_fusion process writes /tf without it)") from None
 
 
-def _smooth_in_child(connection, params, logs):
+def _smooth_in_child(connection, file):
     """Entry point of the child process: sends an Outcome and the number of samples, then these
     in pieces; or the reason why there are none."""
     try:
+        params, logs = pickle.loads(Path(file).read_bytes())
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smoothing.smooth(params, logs)
         samples = result.samples
@@ -81,8 +84,12 @@ class _Child:
     def __init__(self, params, logs):
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe(duplex=False)
+        # In a file: a child that is killed before it has read its arguments stalls its parent.
+        self._file = tempfile.NamedTemporaryFile(prefix="imu_fusion_")  # noqa: SIM115, see close
+        pickle.dump((params, logs), self._file)
+        self._file.flush()
         self._process = spawn.Process(target=_smooth_in_child, daemon=True,
-                                      args=(theirs, params, logs))
+                                      args=(theirs, self._file.name))
         self._process.start()
         theirs.close()
         self.samples: Any = None
@@ -116,6 +123,7 @@ class _Child:
         self._process.kill()
         self._process.join()
         self._pipe.close()
+        self._file.close()
 
 
 class SmootherNode(Node):
@@ -154,7 +162,7 @@ class SmootherNode(Node):
         # Reentrant: a second call is answered while the first one still waits.
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
-        self.create_service(Trigger, "~/clear", self._on_clear)
+        self.offer("clear", self._clear)
         self.start_diagnostics("collection", self._status)
 
     def work(self) -> float:
@@ -267,10 +275,9 @@ class SmootherNode(Node):
             self._outputs[topic].publish(cdr)
         return True
 
-    def _on_clear(self, request, response):
+    def _clear(self):
         self._stream.reset()
-        response.success, response.message = True, "the collection is empty"
-        return response
+        return "the collection is empty"
 
     def _status(self):
         stream = self._stream
@@ -285,8 +292,3 @@ class SmootherNode(Node):
         if self._result is not None or self._messages is not None:
             return DiagnosticStatus.OK, "publishing", values
         return DiagnosticStatus.OK, "collecting", values
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of the executable."""
-    return run_node(SmootherNode, args)

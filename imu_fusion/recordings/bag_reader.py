@@ -15,11 +15,13 @@ from typing import Any
 
 import zstandard
 
-from imu_fusion.errors import BagError, ImuFusionError, ParameterError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, MessageError, ParameterError, TopicError
+from imu_fusion.messages.nested import Nested, nested
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.recordings.mcap_storage import McapStorage
 from imu_fusion.recordings.ros1_storage import Ros1Storage
+from imu_fusion.recordings.source_storage import SourceStorage, format_of
 from imu_fusion.recordings.sqlite_storage import SqliteStorage
 from imu_fusion.recordings.storage import (
     DamageError,
@@ -50,15 +52,19 @@ class TopicInfo:
     qos_profiles: list[dict] = field(default_factory=list)
 
 
-def open_bag(path: str | Path) -> "Reader":
+def open_bag(path: str | Path, description: str | Path | None = None) -> "Reader":
     """Open a recording for reading: a context manager with ``topics`` and ``messages``.
 
     Args:
         path: a rosbag2 directory, an ``.mcap`` or ``.db3`` file (also ``.mcap.zstd``,
-            ``.db3.zstd``), or a ROS 1 ``.bag``.
+            ``.db3.zstd``), a ROS 1 ``.bag``, or what a device has written in one of the formats of
+            :mod:`imu_fusion.sources.registry`.
+        description: YAML file that says what a table of a device holds, or what the export of a
+            device does not tell.
 
     Raises:
         BagError: nothing there, not a recording, or damaged beyond reading.
+        SampleError, ParameterError: the file of a device, or the description, is not usable.
     """
     path = Path(path)
     reader = Reader(path)
@@ -66,7 +72,10 @@ def open_bag(path: str | Path) -> "Reader":
         try:
             if not path.exists():
                 raise BagError(f"{path}: no such file or directory")
-            reader.open(_storage_files(path, reader.warnings))
+            if description is not None or not _is_recording(path):
+                reader.open_source(description)
+            else:
+                reader.open(_storage_files(path, reader.warnings))
         except (OSError, ValueError) as error:    # ValueError: a name that no file can have
             if isinstance(error, ImuFusionError):
                 raise
@@ -83,9 +92,6 @@ def open_bag(path: str | Path) -> "Reader":
 def _storage_files(path: Path, warnings: list[str]) -> list[Path]:
     """The files of a recording, in order; what is wrong with its metadata goes to ``warnings``."""
     if path.is_file():
-        if not path.name.endswith((*DATA_SUFFIXES, ".bag")):
-            raise BagError(f"{path}: not a recording; expected a rosbag2 directory or a "
-                           ".mcap, .db3 or .bag file")
         return [path]
     for suffix in DATA_SUFFIXES:
         files = sorted((p for p in path.iterdir() if p.name.endswith(suffix) and p.is_file()),
@@ -93,6 +99,13 @@ def _storage_files(path: Path, warnings: list[str]) -> list[Path]:
         if files:
             return _named(path, files, warnings)
     raise BagError(f"{path}: a directory without .mcap or .db3 files is not a recording")
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether the names say so; what is none may be of a device."""
+    if path.is_file():
+        return path.name.endswith((*DATA_SUFFIXES, ".bag"))
+    return any(file.name.endswith(DATA_SUFFIXES) for file in path.iterdir())
 
 
 def _split_index(path: Path) -> tuple[int, str]:
@@ -127,7 +140,8 @@ def _named(path: Path, files: list[Path], warnings: list[str]) -> list[Path]:
 
 class Reader:
     """A recording; ``warnings`` says what is wrong with it, as far as it is known by now: what is
-    damaged inside is found while it is read. ``damaged`` tells whether anything is lost."""
+    damaged inside is found while it is read. ``damaged`` tells whether anything is lost,
+    ``format`` what a device's file was taken for."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -135,6 +149,8 @@ class Reader:
         self.start_time = self.end_time = 0
         self.warnings: list[str] = []
         self.damaged = False    # messages are lost
+        self.format = ""
+        self._nested: dict[str, tuple[str, Nested]] = {}    # topic.field: (topic, what is there)
         self._storages: list[Storage] = []
         self._stored: dict[str, StoredTopic] = {}
         self._temporary: list[Any] = []
@@ -171,6 +187,28 @@ class Reader:
             raise BagError(f"{self.path}: damaged, and nothing could be recovered "
                            f"({'; '.join(self.warnings)})")
 
+    def open_source(self, description: str | Path | None = None) -> None:
+        """Open what a device has written; see :func:`open_bag`."""
+        known = format_of(self.path)
+        content = None if description is None else read_yaml(description)
+        if known is None and description is None:
+            if self.path.is_dir():
+                raise BagError(f"{self.path}: a directory without .mcap or .db3 files is not a "
+                               "recording, and it holds no export of a device that is known")
+            raise BagError(f"{self.path}: not a recording; expected a rosbag2 directory, a .mcap, "
+                           ".db3 or .bag file, or the export of a device. A table of numbers "
+                           "needs a description: imu_fusion describe writes a first one")
+        # Where there is a description, a table is read as that says.
+        if content is not None and (known is None or not known.options):
+            known = None
+        self.format = "table as described" if known is None else known.about
+        self._storages.append(SourceStorage(self.path, self.lose, self.mention, known, content,
+                                            str(description)))
+        self._add(self._storages[0])
+        assert self._storages[0].times is not None
+        self.start_time, self.end_time = self._storages[0].times
+        self.end_time += 1
+
     def close(self) -> None:
         """Release the files."""
         for storage in self._storages:
@@ -192,6 +230,9 @@ class Reader:
                 out: see ``warnings``.
         """
         wanted = {name for name in self.topics if topics is None or name in topics}
+        fields = {name: self._nested[name] for name in wanted if name in self._nested}
+        asked = wanted - fields.keys()
+        wanted = asked | {topic for topic, _ in fields.values()}
         parts = [Part(storage.times[0] if storage.times else 0, 0,
                       partial(storage.messages, wanted, start, stop))
                  for storage in self._storages]
@@ -203,7 +244,15 @@ class Reader:
                     if unpacked is None:
                         continue
                     data = unpacked
-                yield topic, self.topics[topic].msgtype, log_time, data
+                if topic in asked:
+                    yield topic, self.topics[topic].msgtype, log_time, data
+                for name, (holder, field) in fields.items():
+                    if holder == topic:
+                        try:
+                            yield name, field.msgtype, log_time, field.extract(data)
+                        except MessageError as error:
+                            self.lose(f"{name}: messages cannot be decoded and are left out "
+                                      f"({error})")
         except ImuFusionError:
             raise
         except Exception as error:
@@ -217,7 +266,7 @@ class Reader:
 
     def require(self, name: str, msgtype: str | None = None) -> TopicInfo:
         """The TopicInfo of ``name`` (with or without leading slash), or a TopicError."""
-        key = find_topic(self.topics, name)
+        key = self.find(name)
         if key is None:
             listing = ", ".join(f"{t.name} ({t.msgtype})" for t in self.topics.values()) or "none"
             raise TopicError(f"{self.path}: no topic '{name}'; it has: {listing}")
@@ -225,6 +274,30 @@ class Reader:
         if msgtype and info.msgtype != msgtype:
             raise TopicError(f"{self.path}: topic '{name}' is {info.msgtype}, expected {msgtype}")
         return info
+
+    def find(self, name: str) -> str | None:
+        """The topic that ``name`` is up to a leading slash, or None. ``topic.field`` is a message
+        inside of those of a topic, such as a sensor_msgs/Imu in the message of a driver."""
+        found = find_topic(self.topics, name)
+        if found is not None:
+            return found
+        holder, field = name, ""
+        while "." in holder:
+            holder, _, last = holder.rpartition(".")
+            field = f"{last}.{field}".rstrip(".")
+            topic = find_topic(self.topics, holder)
+            definition = None if topic is None else self.definition(topic)
+            if topic is None or definition is None:
+                continue
+            inside = nested(self.topics[topic].msgtype, definition[0], field)
+            if inside is not None:
+                full = f"{topic}.{field}"
+                self._nested[full] = topic, inside
+                self._stored[full] = StoredTopic(full, inside.msgtype)
+                self.topics[full] = TopicInfo(full, inside.msgtype, self.topics[topic].count,
+                                              self.topics[topic].qos_profiles)
+                return full
+        return None
 
     def definition(self, topic: str) -> tuple[str, str] | None:
         """(ros2msg definition with its dependencies, RIHS01 hash) of the type of a topic, as the

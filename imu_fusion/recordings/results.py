@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,16 @@ def read_results(directory: str | Path) -> dict | None:
     """What nodes found, None without such a file."""
     file = Path(directory) / RESULTS_FILE
     return json.loads(file.read_text()) if file.exists() else None
+
+
+def left_out(refused: Mapping[str, Mapping], lost: Sequence[str]) -> dict[str, dict]:
+    """The entry on what was not used, {} where there is nothing to say.
+
+    Args:
+        refused: node to topic to reasons and how many of each. lost: of the recording, in words.
+    """
+    found: dict[str, Any] = {node: topics for node, topics in refused.items() if topics}
+    return {LEFT_OUT: found | ({RECORDING: list(lost)} if lost else {})} if found or lost else {}
 
 
 def is_incomplete(directory: str | Path) -> bool:

@@ -42,6 +42,7 @@ class Contents:
         changes: (stamps, values) of the movement mask, or None.
         warnings: texts on what was left out.
         start: int ns, log time of the first message; ``duration_s`` up to the last one.
+        damaged: whether parts of the recording are lost.
     """
 
     topics: list[TopicReport]
@@ -51,6 +52,7 @@ class Contents:
     warnings: tuple[str, ...]
     start: int
     duration_s: float
+    damaged: bool
 
     def log(self, topic: str | None) -> Any:
         """The log of a topic, or None."""
@@ -77,7 +79,8 @@ def read_contents(path: str | Path) -> Contents:
         logs = {name: _usable(found[name].log, name, warnings) for name, layout in wanted.items()
                 if name in found and found[name].msgtype == layout.msgtype}
         return Contents(topics, logs, reference_name, moving_changes(reader), tuple(warnings),
-                        reader.start_time, (reader.end_time - reader.start_time) * 1e-9)
+                        reader.start_time, (reader.end_time - reader.start_time) * 1e-9,
+                        reader.damaged)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ import datetime
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,6 +44,14 @@ from imu_fusion.report.orientation_status import shades as status_shades
 from imu_fusion.report.overview import overview_section
 from imu_fusion.report.smoother import Smoothed, smoother_numbers, smoother_sections
 from imu_fusion.samples import AttitudeLog, MagLog, seconds
+
+
+class Written(NamedTuple):
+    """What a report was made of: ``smoothed`` None if there is nothing to smooth; ``complete``:
+    nothing of the recording was lost."""
+
+    smoothed: Smoothed | None
+    complete: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +127,7 @@ class _Material:
 
 
 def write_recording_report(bag: str | Path, estimates: str | Path | None, path: str | Path,
-                           params_file: str | Path | None = None) -> Smoothed | None:
+                           params_file: str | Path | None = None) -> Written:
     """Write the HTML report of a recording; its trajectory is what ``process`` would make of it.
 
     Args:
@@ -131,7 +140,7 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
         params_file: ROS 2 parameter file of the estimators, or None for defaults.
 
     Returns:
-        Smoothed, or None if there is nothing to smooth.
+        Written.
 
     Raises:
         BagError, TopicError: a recording cannot be read, or holds nothing to report about.
@@ -144,7 +153,7 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
     date = datetime.datetime.fromtimestamp(contents.start * 1e-9, datetime.UTC)
     write_report(path, Path(bag).resolve().name, sections,
                  f"{bag}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
-    return material.smoothed
+    return Written(material.smoothed, not contents.damaged)
 
 
 def _gather(bag, estimates, params_file) -> _Material:

@@ -9,12 +9,13 @@ half of one) follows the first of the topics that have one clock: what is later 
 that one's epoch belongs to the next. It is given ``JUMP`` to show the jump itself.
 """
 
+from collections import deque
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from imu_fusion.samples.guard import JUMP, Guard, Judged, Verdict
+from imu_fusion.samples.guard import JUMP, Guard, Judged, Run, Verdict
 
 Samples = tuple[np.ndarray, np.ndarray]
 """Stamps (n,) int64 ns, ascending, and values (n, k) of one topic."""
@@ -22,6 +23,8 @@ Samples = tuple[np.ndarray, np.ndarray]
 
 def joined(parts: Sequence[Samples]) -> Samples:
     """Samples of one topic that follow each other."""
+    if len(parts) == 1:
+        return parts[0]
     return (np.concatenate([stamp for stamp, _ in parts]),
             np.concatenate([values for _, values in parts]))
 
@@ -43,16 +46,15 @@ class BlockMerger:
 
     Args:
         topics: names, in order of rank at equal stamps.
-        widths: how many numbers a sample of each has.
         refused: called with (topic, stamps, list of Verdict) of what its guard has refused.
         one_clock: topics whose sensors share a clock, the one that others follow first; None:
             all of them, and none follows.
     """
 
-    def __init__(self, topics: Mapping[str, int],
+    def __init__(self, topics: Iterable[str],
                  refused: Callable[[str, np.ndarray, list[Verdict]], object] = lambda *_: None,
                  one_clock: Collection[str] | None = None) -> None:
-        self._widths = dict(topics)
+        self._topics = tuple(topics)
         self._refused = refused
         self._one_clock = one_clock
         self._leader = next(iter(one_clock or ()), None)
@@ -66,10 +68,10 @@ class BlockMerger:
         named = session_topics or ()
         self.strict = session_topics is not None
         self.guards = {topic: Guard(self._one_clock is None or topic in self._one_clock)
-                       for topic in self._widths}
+                       for topic in self._topics}
         self._epoch = 0
-        self._open = {topic for topic in self._widths if topic in named}
-        self._waiting = {topic: _Waiting(width) for topic, width in self._widths.items()}
+        self._open = {topic for topic in self._topics if topic in named}
+        self._waiting: dict[str, deque[Run]] = {topic: deque() for topic in self._topics}
 
     def add(self, blocks: Mapping[str, Samples]) -> list[Segment]:
         """Take samples in order of arrival within each topic; return what may be used now."""
@@ -87,45 +89,41 @@ class BlockMerger:
     def _wait(self, topic: str, judged: Judged) -> None:
         if judged.verdicts:
             self._refused(topic, np.array(judged.refused_stamps), judged.verdicts)
-        self._waiting[topic].append(judged.stamp, judged.epochs, judged.values)
+        self._waiting[topic].extend(judged.runs)
 
     def _follow(self) -> None:
         """Let topics that did not see the clock set back follow the one that did."""
-        if self._leader is None:
-            return
-        ends = self.guards[self._leader].ends
-        for topic, guard in self.guards.items():
-            waiting = self._waiting[topic]
-            while topic != self._leader and len(waiting.stamp):
-                late = np.zeros(len(waiting.stamp), dtype=bool)
-                for epoch, end in ends.items():
-                    late |= (waiting.epochs == epoch) & (waiting.stamp > end + JUMP)
-                if not late.any():
-                    break
-                waiting.epochs = waiting.epochs.copy()
-                waiting.epochs[int(np.argmax(late)):] += 1
-                guard.epoch += 1
+        ends = self.guards[self._leader].ends if self._leader is not None else {}
+        for topic, guard in self.guards.items() if ends else ():
+            if topic == self._leader:
+                continue
+            followed: deque[Run] = deque()
+            ahead = 0
+            for epoch, stamp, values in self._waiting[topic]:
+                epoch += ahead
+                while epoch in ends and len(stamp) and stamp[-1] > ends[epoch] + JUMP:
+                    at = int(stamp.searchsorted(ends[epoch] + JUMP, side="right"))
+                    followed.append(Run(epoch, stamp[:at], values[:at]))
+                    epoch, stamp, values = epoch + 1, stamp[at:], values[at:]
+                    ahead += 1
+                followed.append(Run(epoch, stamp, values))
+            self._waiting[topic] = deque(run for run in followed if len(run.stamp))
+            guard.epoch += ahead
 
     @property
     def held(self) -> int:
         """Number of samples that wait for another topic."""
-        return sum(len(waiting.stamp) for waiting in self._waiting.values())
+        return sum(len(run.stamp) for runs in self._waiting.values() for run in runs)
 
     def _release(self) -> list[Segment]:
         self._follow()
         bound = self._bound()
-        taken = {topic: waiting.take(bound) for topic, waiting in self._waiting.items()}
+        taken = {topic: _up_to(bound, runs) for topic, runs in self._waiting.items() if runs}
         segments = []
-        if all((epochs == self._epoch).all() for _, epochs, _ in taken.values()):
-            samples = {topic: (stamp, values) for topic, (stamp, _, values) in taken.items()
-                       if len(stamp)}
-            return [Segment(False, samples)] if samples else []
-        for epoch in np.unique(np.concatenate([epochs for _, epochs, _ in taken.values()])):
-            samples = {topic: (stamp[epochs == epoch], values[epochs == epoch])
-                       for topic, (stamp, epochs, values) in taken.items()
-                       if (epochs == epoch).any()}
-            segments.append(Segment(bool(epoch > self._epoch), samples))
-            self._epoch = max(self._epoch, int(epoch))
+        for epoch in sorted({epoch for parts in taken.values() for epoch in parts}):
+            segments.append(Segment(epoch > self._epoch, {
+                topic: joined(parts[epoch]) for topic, parts in taken.items() if epoch in parts}))
+            self._epoch = max(self._epoch, epoch)
         if not self.strict:
             # The other topics' clocks were set back too, seen yet or not.
             for guard in self.guards.values():
@@ -140,30 +138,19 @@ class BlockMerger:
                    default=None)
 
 
-class _Waiting:
-    """Samples of one topic, in order of epoch and stamp."""
-
-    def __init__(self, width: int) -> None:
-        self.stamp = np.empty(0, np.int64)
-        self.epochs = np.empty(0, np.int64)
-        self.values = np.empty((0, width))
-
-    def append(self, stamp: np.ndarray, epochs: np.ndarray, values: np.ndarray) -> None:
-        if not len(self.stamp):
-            self.stamp, self.epochs, self.values = stamp, epochs, values
-        elif len(stamp):
-            self.stamp = np.concatenate([self.stamp, stamp])
-            self.epochs = np.concatenate([self.epochs, epochs])
-            self.values = np.concatenate([self.values, values])
-
-    def take(self, bound: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Remove and return (stamps, epochs, values) up to ``bound``, both parts inclusive."""
-        count = len(self.stamp)
-        if bound is not None:
-            first, last = (int(np.searchsorted(self.epochs, bound[0], side=side))
-                           for side in ("left", "right"))
-            count = first + int(np.searchsorted(self.stamp[first:last], bound[1], side="right"))
-        taken = self.stamp[:count], self.epochs[:count], self.values[:count]
-        self.stamp, self.epochs, self.values = (self.stamp[count:], self.epochs[count:],
-                                                self.values[count:])
-        return taken
+def _up_to(bound: tuple[int, int] | None, runs: deque[Run]) -> dict[int, list[Samples]]:
+    """Remove what lies before epoch and stamp ``bound``, both inclusive (None: all); return it by
+    epoch."""
+    taken: dict[int, list[Samples]] = {}
+    while runs:
+        epoch, stamp, values = runs[0]
+        count = len(stamp)
+        if bound is not None and (epoch, int(stamp[-1])) > bound:
+            count = int(stamp.searchsorted(bound[1], side="right")) if epoch == bound[0] else 0
+        if count:
+            taken.setdefault(epoch, []).append((stamp[:count], values[:count]))
+        if count < len(stamp):
+            runs[0] = Run(epoch, stamp[count:], values[count:])
+            break
+        runs.popleft()
+    return taken

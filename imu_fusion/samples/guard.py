@@ -16,13 +16,12 @@ All of this follows from the sequence of the samples of a topic alone, not from 
 
 import enum
 from collections import Counter
-from typing import NamedTuple, TypeVar
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.samples.logs import Log
-
-AnyLog = TypeVar("AnyLog", bound=Log)
+from imu_fusion.samples.logs import AnyLog
 
 JUMP = 1_000_000_000
 """Nanoseconds. Transport delays reorder samples by less, sensors pause for less."""
@@ -49,15 +48,21 @@ class Verdict(enum.Enum):
     WILD = "stamp far from those before and after"
 
 
-class Judged(NamedTuple):
-    """Samples fit for use: ``stamp`` (n,), ``values`` (n, k), ``epochs`` (n,); and the stamps and
-    Verdicts of what was refused."""
+class Run(NamedTuple):
+    """Samples of one topic and one epoch: stamps (n,) int64 ns, ascending, and values (n, k)."""
 
+    epoch: int
     stamp: np.ndarray
     values: np.ndarray
-    epochs: np.ndarray
-    refused_stamps: list[int]
-    verdicts: list[Verdict]
+
+
+@dataclass
+class Judged:
+    """Samples fit for use, in order; and the stamps and Verdicts of what was refused."""
+
+    runs: list[Run] = field(default_factory=list)
+    refused_stamps: list[int] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
 
 
 class Guard:
@@ -92,15 +97,18 @@ class Guard:
 
     def take(self, stamp: np.ndarray, values: np.ndarray) -> Judged:
         """Judge the next n samples: (n,) int64 ns, (n, k) float64."""
-        found = _Found(values[:0])
+        found = Judged()
         n = len(stamp)
+        if self._is_usual(stamp, values):
+            self._accept(found, stamp, values)
+            return found
         fine = np.isfinite(values).all(axis=1) & (stamp >= 0)
-        step = np.diff(stamp)
+        step = stamp[1:] - stamp[:-1]
         breaks = np.flatnonzero(~(fine[1:] & (step > 0) & (step <= JUMP))) + 1
         i = 0
         while i < n:
             if not self._held and fine[i] and self._follows(int(stamp[i]), JUMP):
-                following = int(np.searchsorted(breaks, i + 1))
+                following = int(breaks.searchsorted(i + 1))
                 end = int(breaks[following]) if following < len(breaks) else n
                 self._accept(found, stamp[i:end], values[i:end])
                 i = end
@@ -111,28 +119,37 @@ class Guard:
                 self._refuse(found, int(stamp[i]), Verdict.NEGATIVE
                              if np.isfinite(values[i]).all() else Verdict.NOT_FINITE)
             i += 1
-        return found.judged()
+        return found
 
     def finish(self) -> Judged:
         """The end of the topic: what is held back, judged without a sample after it."""
-        found = _Found(np.empty((0, len(self._held[0][1]) if self._held else 0)))
+        found = Judged()
         if self._held:
             ahead = self._held[0][0] - (self.last or 0)
             if 0 < ahead <= _UNPROVEN:
                 self._believe(found)
             else:
                 self._drop(found)
-        return found.judged()
+        return found
 
     def refused(self) -> dict[str, int]:
         """Counts of what was refused, in words."""
         return {verdict.value: count for verdict, count in self.counts.items()
                 if verdict is not Verdict.OK and count}
 
+    def _is_usual(self, stamp: np.ndarray, values: np.ndarray) -> bool:
+        """Whether nothing is to be judged: each sample is fine and follows the one before."""
+        if self._held or not len(stamp) or not self._follows(int(stamp[0]), JUMP):
+            return False
+        if stamp[0] < 0 or not np.isfinite(values).all():
+            return False
+        step = stamp[1:] - stamp[:-1]
+        return not len(step) or bool(step.min() > 0 and step.max() <= JUMP)
+
     def _follows(self, stamp: int, limit: int) -> bool:
         return self.last is None or 0 < stamp - self.last <= limit
 
-    def _judge(self, found: "_Found", stamp: int, row: np.ndarray) -> None:
+    def _judge(self, found: Judged, stamp: int, row: np.ndarray) -> None:
         """Judge one sample that is not simply the next one."""
         limit = max(JUMP, _SLOW * self._interval)
         follows = self._follows(stamp, limit)
@@ -171,7 +188,7 @@ class Guard:
         usual = self._usual()
         return 2 if abs(stamp - held - usual) <= abs(stamp - self.last - usual) else 0
 
-    def _believe(self, found: "_Found") -> None:
+    def _believe(self, found: Judged) -> None:
         held, self._held = self._held, []
         assert self.last is not None
         if held[0][0] < self.last or held[0][0] > self.last + OTHER_CLOCK:
@@ -180,28 +197,28 @@ class Guard:
         self._accept(found, np.array([stamp for stamp, _ in held]),
                      np.array([row for _, row in held]))
 
-    def _drop(self, found: "_Found") -> None:
+    def _drop(self, found: Judged) -> None:
         held, self._held = self._held, []
         assert self.last is not None
         near = self.last - JUMP <= held[0][0] < self.last
         for stamp, _ in held:
             self._refuse(found, stamp, Verdict.BACKWARDS if near else Verdict.WILD)
 
-    def _accept(self, found: "_Found", stamp: np.ndarray, values: np.ndarray) -> None:
-        found.kept.append((stamp, values, self.epoch))
+    def _accept(self, found: Judged, stamp: np.ndarray, values: np.ndarray) -> None:
+        found.runs.append(Run(self.epoch, stamp, values))
         self.counts[Verdict.OK] += len(stamp)
         if len(stamp) > 1:
             self._interval = int(stamp[-1] - stamp[-2])
         elif self.last is not None:
             self._interval = int(stamp[-1]) - self.last
         self.last = int(stamp[-1])
-        first = int(np.searchsorted(stamp, self.last - JUMP))
+        first = int(stamp.searchsorted(self.last - JUMP))
         if first or len(self._latest) > _PARTS:
             before = self._together() if not first else []
             self._latest = [part for part in before if len(part[0])]
         self._latest.append((stamp[first:].copy(), values[first:].copy()))
 
-    def _refuse(self, found: "_Found", stamp: int, verdict: Verdict) -> None:
+    def _refuse(self, found: Judged, stamp: int, verdict: Verdict) -> None:
         self.counts[verdict] += 1
         found.refused_stamps.append(stamp)
         found.verdicts.append(verdict)
@@ -211,7 +228,7 @@ class Guard:
         assert self.last is not None
         stamp = np.concatenate([s for s, _ in self._latest])
         values = np.concatenate([v for _, v in self._latest])
-        first = int(np.searchsorted(stamp, self.last - JUMP))
+        first = int(stamp.searchsorted(self.last - JUMP))
         self._latest = [(stamp[first:], values[first:])]
         return self._latest
 
@@ -223,7 +240,7 @@ class Guard:
         """Whether the very same sample has been taken lately. Of a signal that stands still, equal
         values are no sign of it."""
         stamps, values = self._together()[0]
-        place = int(np.searchsorted(stamps, stamp))
+        place = int(stamps.searchsorted(stamp))
         return (place < len(stamps) and stamps[place] == stamp
                 and bool((values[place] == row).all() and (values != row).any()))
 
@@ -235,43 +252,22 @@ class Guard:
         if not self._small_jumps:
             return True
         stamps = self._together()[0][0]
-        place = int(np.searchsorted(stamps, stamp))
+        place = int(stamps.searchsorted(stamp))
         return place > 0 and bool(
             stamps[place] > stamp and stamps[place] - stamps[place - 1] > _HOLE * self._usual())
 
 
-class _Found:
-    """What a Guard finds in one block."""
-
-    def __init__(self, none: np.ndarray) -> None:
-        self._none = none
-        self.kept: list[tuple[np.ndarray, np.ndarray, int]] = []
-        self.refused_stamps: list[int] = []
-        self.verdicts: list[Verdict] = []
-
-    def judged(self) -> Judged:
-        if len(self.kept) == 1:
-            stamp, values, epoch = self.kept[0]
-            epochs = np.full(len(stamp), epoch, dtype=np.int64)
-        else:
-            stamp = np.concatenate([np.empty(0, np.int64), *(s for s, _, _ in self.kept)])
-            values = np.concatenate([self._none, *(v for _, v, _ in self.kept)])
-            epochs = np.concatenate([np.empty(0, np.int64), *(
-                np.full(len(s), epoch, np.int64) for s, _, epoch in self.kept)])
-        return Judged(stamp, values, epochs, self.refused_stamps, self.verdicts)
-
-
-def guard_log(log: AnyLog) -> tuple[AnyLog, np.ndarray, Guard]:
-    """The usable samples of a whole log.
+def guard_log(log: AnyLog, small_jumps: bool = True) -> tuple[AnyLog, np.ndarray, Guard]:
+    """The usable samples of a whole log; ``small_jumps`` as of Guard.
 
     Returns:
         (log of what is fit for use, epochs (n,) int64 of its samples, Guard with the counts)
     """
-    guard = Guard()
+    guard = Guard(small_jumps)
     places = np.arange(len(log))[:, None].astype(np.float64)
     finite = np.isfinite(log.flat()).all(axis=1)
-    parts = [guard.take(log.stamp, np.where(finite[:, None], places, np.nan)), guard.finish()]
-    keep = np.concatenate([part.values[:, 0] for part in parts if len(part.stamp)]
-                          or [np.empty(0)]).astype(np.int64)
-    epochs = np.concatenate([part.epochs for part in parts])
+    judged = guard.take(log.stamp, np.where(finite[:, None], places, np.nan)).runs
+    runs = [Run(0, log.stamp[:0], places[:0]), *judged, *guard.finish().runs]
+    keep = np.concatenate([run.values[:, 0] for run in runs]).astype(np.int64)
+    epochs = np.concatenate([np.full(len(run.stamp), run.epoch) for run in runs])
     return (log, epochs, guard) if len(keep) == len(log) else (log[keep], epochs, guard)

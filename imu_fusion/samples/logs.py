@@ -5,12 +5,15 @@ are fit for use is decided by :mod:`imu_fusion.samples.guard`.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from imu_fusion.errors import SampleError
+
+AnyLog = TypeVar("AnyLog", bound="Log")
 
 
 def seconds(stamp: np.ndarray, origin: int) -> np.ndarray:
@@ -68,6 +71,17 @@ class Log:
                    for name, shape in self._columns() if getattr(self, name) is not None]
         return np.concatenate([np.empty((len(self), 0)), *columns], axis=1)
 
+    @staticmethod
+    def joined(logs: "Sequence[AnyLog]") -> "AnyLog":
+        """Logs of one type that follow each other, at least one, as one; the frame of the first."""
+        first = logs[0]
+        if len(logs) == 1:
+            return first
+        columns = {name: np.concatenate([getattr(log, name) for log in logs])
+                   for name, _ in first._columns() if getattr(first, name) is not None}
+        return dataclasses.replace(
+            first, stamp=np.concatenate([log.stamp for log in logs]), **columns)
+
     def between(self, start: int, stop: int) -> Self:
         """The rows with ``start <= stamp < stop`` (int nanoseconds)."""
         return self[(self.stamp >= start) & (self.stamp < stop)]
@@ -75,11 +89,16 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class ImuLog(Log):
-    """Gyroscope ``gyr`` (n, 3) rad/s and specific force ``acc`` (n, 3) m/s^2."""
+    """Gyroscope ``gyr`` (n, 3) rad/s and specific force ``acc`` (n, 3) m/s^2.
+
+    ``gyr_sd`` (n, 3) rad/s: standard deviation of rates that were recovered, as white noise that
+    does as much; zero where a rate was measured. None: all were.
+    """
 
     gyr: np.ndarray = _column((3,))
     acc: np.ndarray = _column((3,))
     frame_id: str = "imu_link"
+    gyr_sd: np.ndarray | None = _column((3,))
 
 
 @dataclass(frozen=True, eq=False)

@@ -155,7 +155,7 @@ def messages(config: FieldConfiguration, rows: np.ndarray) -> list[Messages]:
     made = [
         Messages(IMU_TOPIC, stamp, imu_messages(
             stamp, frame, rows["omega"], rows["cov_omega"], rows["specific_force"],
-            rows["cov_specific_force"], rows["quat"], turn @ rows["cov_attitude"] @ back,
+            rows["cov_specific_force"], rows["quat"], rows["cov_attitude"],
             np.ones(len(rows), dtype=bool))),
         Messages(ACCEL_TOPIC, stamp, ACCEL.encode_block(stamp, frame, np.hstack(
             [acceleration, rows["alpha"], cov.reshape(-1, 36)])))]

@@ -84,8 +84,28 @@ def _without_lost(acc, had_force):
     while is not in free fall: that sample is refused.
     """
     present = acc.any(axis=1)
+    if present.all():
+        return acc
     lost = ~present & (np.logical_or.accumulate(present) | had_force)
     return np.where(lost[:, None], np.nan, acc)
+
+
+class _Pace:
+    """Chooses samples at least an ``interval`` (ns) apart, however they come in blocks."""
+
+    def __init__(self, interval):
+        self._interval = interval
+        self.next = -1 << 63
+
+    def chosen(self, stamp):
+        """Indices of stamps (n,), ascending."""
+        found = []
+        k = int(stamp.searchsorted(self.next))
+        while k < len(stamp):
+            found.append(k)
+            self.next = int(stamp[k]) + self._interval
+            k = int(stamp.searchsorted(self.next))
+        return found
 
 
 class _Writer:
@@ -98,7 +118,7 @@ class _Writer:
         self._up = _UP[params.world_frame]
         self._output = output
         self._flags = None
-        self._next_bias = None
+        self._bias_pace = _Pace(_BIAS_INTERVAL)
         self.turn = 0.0
         self.yaw = None
 
@@ -112,7 +132,7 @@ class _Writer:
         self.yaw = math.atan2(self._up * east[1], east[0])
         return [Messages(ORIENTATION_TOPIC, stamp, cdrs),
                 Messages(RPY_TOPIC, stamp, rpy_messages(rows, frame_id)),
-                *self._status(rows, frame_id), self._biases(rows, frame_id)]
+                *self._status(rows, frame_id), *self._biases(rows, frame_id)]
 
     def corrected(self, rows, frame_id):
         """Messages of rows that looking ahead has corrected."""
@@ -123,7 +143,7 @@ class _Writer:
     def restart(self):
         """What comes next is another stretch, perhaps at earlier stamps."""
         self.turn = 0.0
-        self._next_bias = None
+        self._bias_pace = _Pace(_BIAS_INTERVAL)
 
     def set_yaw(self, yaw):
         """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
@@ -132,12 +152,12 @@ class _Writer:
     def _status(self, rows, frame_id):
         """Messages of flags where they change."""
         flags = lasting_flags(rows["flags"], self._flags or 0)
-        before = np.concatenate([[flags[0] if self._flags is None else self._flags], flags[:-1]])
-        changed, turned = flags != before, (flags ^ before) & FLAG_STILL != 0
-        if self._flags is None:
-            changed[0] = turned[0] = True
-        self._flags = int(flags[-1])
+        if (flags == self._flags).all():
+            return []
         stamp = rows["stamp"]
+        before = np.append(~flags[0] if self._flags is None else self._flags, flags[:-1])
+        changed, turned = flags != before, (flags ^ before) & FLAG_STILL != 0
+        self._flags = int(flags[-1])
         return [
             Messages(STEADY_TOPIC, stamp[turned],
                      [bool_message(bool(f & FLAG_STILL)) for f in flags[turned].tolist()]),
@@ -147,17 +167,9 @@ class _Writer:
 
     def _biases(self, rows, frame_id):
         """Messages of the bias, at most one per _BIAS_INTERVAL."""
-        stamp, chosen = rows["stamp"], []
-        k = 0
-        while k < len(stamp):
-            if self._next_bias is not None and stamp[k] < self._next_bias:
-                k += int(np.searchsorted(stamp[k:], self._next_bias))
-                continue
-            chosen.append(k)
-            self._next_bias = int(stamp[k]) + _BIAS_INTERVAL
-            k += 1
-        return Messages(BIAS_TOPIC, stamp[chosen],
-                        [bias_message(rows[k], frame_id) for k in chosen])
+        chosen = self._bias_pace.chosen(rows["stamp"])
+        return [Messages(BIAS_TOPIC, rows["stamp"][chosen],
+                         [bias_message(rows[k], frame_id) for k in chosen])] if chosen else []
 
     def _orientations(self, rows, frame_id):
         """Rows as they are published, and their messages."""
@@ -194,16 +206,6 @@ def turn_to_true_north(params: OrientationParams, stamp: int, sample: np.ndarray
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
-def warm_up(params: OrientationParams) -> None:
-    """Compile, or load from the cache, what the first samples would otherwise wait for."""
-    estimator = OrientationEstimator(params.replace(**{"alignment.duration": 0.05}))
-    for i in range(20):
-        stamp = i * 10_000_000
-        estimator.add_mag(stamp, np.array([0.0, 2e-5, -4e-5]))
-        estimator.add_imu(stamp, np.zeros(3), np.array([0.0, 0.0, 9.81]))
-    estimator.finish()    # with a lag: the smoother
-
-
 def _take(estimator, stamp, gyr, acc, mag_stamp, mag):
     """Samples through the estimator; returns its rows."""
     if len(stamp) + len(mag_stamp) > _FEW:
@@ -237,7 +239,7 @@ class OrientationStream(Stream):
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
-        self._next_calibration: int | None = None
+        self._calibration_pace = _Pace(_CALIBRATION_INTERVAL)
         super().__init__(INPUTS, warn)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
@@ -362,20 +364,23 @@ class OrientationStream(Stream):
     def _collect(self, stamps, values):
         """Samples for a calibration of the magnetometer, as often as they may be new."""
         usable = ~self._screen.saturated(values)
-        stamps, values = stamps[usable], values[usable]
-        k = 0
-        while k < len(stamps):
-            if self._next_calibration is not None and stamps[k] < self._next_calibration:
-                k += int(np.searchsorted(stamps[k:], self._next_calibration))
-                continue
-            self._calibrator.add(values[k])
-            self._next_calibration = int(stamps[k]) + _CALIBRATION_INTERVAL
-            k += 1
+        for k in self._calibration_pace.chosen(stamps[usable]):
+            self._calibrator.add(values[usable][k])
 
     def _write(self, rows):
         frame_id = self.frame_ids.get(IMU_TOPIC, "")
         return (self._writer.messages(rows, frame_id)
                 + self._writer.corrected(self.estimator.take_corrected(), frame_id))
+
+
+def warm_up(params: OrientationParams) -> None:
+    """Compile, or load from the cache, what the first samples would otherwise wait for."""
+    stream = OrientationStream(params.replace(**{"alignment.duration": 0.05}))
+    for i in range(20):
+        stamp = np.array([i * 10_000_000])
+        stream.use({MAG_TOPIC: (stamp, np.array([[0.0, 2e-5, -4e-5]])),
+                    IMU_TOPIC: (stamp, np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 9.81]]))})
+    stream.flush()    # with a lag: the smoother
 
 
 def findings(logs: Mapping[str, Any]) -> list[Finding]:

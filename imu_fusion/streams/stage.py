@@ -10,14 +10,13 @@ from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import parameters_for
 from imu_fusion.samples.findings import Finding
-from imu_fusion.streams.stream import Stream
 
 
 def _no_findings(logs: Mapping) -> list[Finding]:
     return []
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """One estimator, between its topics.
 
@@ -28,7 +27,7 @@ class Stage:
         inputs: topic to the SampleType that reads it; ``required`` are those without which it
             cannot run.
         outputs: topic to message type.
-        stream: ``(*params, warn=...)`` makes the Stream.
+        stream: the class of its Stream, ``(*params, warn=...)``.
         findings: ``(logs)`` lists what looks wrong with whole logs as recorded.
         configure: ``(stage, params_file)`` is (Stage, parameters), where reading the parameters is
             not all: topics may depend on them.
@@ -41,7 +40,7 @@ class Stage:
     inputs: Mapping[str, SampleType]
     required: tuple[str, ...]
     outputs: Mapping[str, str]
-    stream: Callable[..., Stream]
+    stream: type[Any]
     findings: Callable[[Mapping], Sequence[Finding]] = _no_findings
     configure: Callable[["Stage", str | Path | None], tuple["Stage", list]] | None = None
     unusable: str = ""
@@ -55,6 +54,11 @@ class Stage:
         if self.configure is not None:
             return self.configure(self, params_file)
         return self, self.read_params(params_file)
+
+    def has_clock(self, topic: str) -> bool:
+        """Whether the clock of a topic is judged: see Guard."""
+        judged = self.stream.one_clock
+        return judged is None or topic in judged
 
     def read_params(self, params_file: str | Path | None = None) -> list:
         """The objects of ``params`` in a parameter file (or None: defaults)."""

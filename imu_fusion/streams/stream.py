@@ -93,8 +93,7 @@ class Stream:
         self.inputs = inputs
         self.warn = warn
         self.undecodable: Counter[str] = Counter()
-        self._merger = BlockMerger({topic: kind.width for topic, kind in inputs.items()},
-                                   self._refused, self.one_clock)
+        self._merger = BlockMerger(inputs, self._refused, self.one_clock)
         self.reset()
 
     def reset(self, session_topics: Container[str] | None = None) -> None:

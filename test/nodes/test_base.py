@@ -100,6 +100,8 @@ def test_all_parameters_can_be_read_at_once_dumped_and_loaded_back(graph, tmp_pa
              if any(key == info.name for c in cls.PARAMETERS for info in c.infos())}
     if name == "acceleration_field_estimator":
         given |= FOUR
+    if name == "driver":
+        given |= {"source": "nmea", "transport": "udp://127.0.0.1:0"}
     node = graph.start(cls, **given)
     client = graph.node("reader").create_client(GetParameters, f"/{name}/get_parameters")
     graph.until(client.service_is_ready)

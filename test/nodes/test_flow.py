@@ -222,7 +222,8 @@ def test_late_joiner_gets_everything_from_where_it_joined(graph):
     missed = late.input.missed
     assert 0 < missed < 30_000
     assert late.values[-(30_000 - missed):] == list(range(missed, 30_000))
-    assert not late.flow.problems and not late.input.lost
+    assert not late.input.lost and late.flow.problems == [
+        f"joined /sender late: {missed} of its messages had been sent before"]
 
 
 def test_node_between_that_joins_late_says_what_is_not_in_its_session(graph):
@@ -256,7 +257,8 @@ def test_node_between_that_is_stopped_while_its_sender_goes_on_says_so(graph):
     graph.until(lambda: receiver.ended and early.ended)
     assert receiver.flow.problems == [
         "/doubler made its messages of incomplete data: it lacks at least 1 messages"]
-    assert not early.flow.problems and not sender.flow.problems
+    assert not early.flow.problems
+    assert sender.flow.problems == ["/doubler has left in mid-session"]
 
 
 def test_vanished_consumer_is_named_and_does_not_block_the_others(graph):
@@ -278,14 +280,16 @@ def test_restarted_under_its_name_it_is_somebody_else(graph):
     sender = Sender(graph, wait_for=["receiver", "stays"])
     sender.session(60_000)
     graph.until(lambda: len(first.values) > 10)
-    first.flow.close()  # an orderly end: nobody minds
+    first.flow.close()
     graph.remove(first.node)
     again = Receiver(graph, "receiver")
     graph.until(lambda: stays.ended and again.ended)
     assert stays.values == list(range(60_000))
     assert again.values[-1] == 59_999 and again.input.missed + len(again.values) >= 60_000
-    for part in (sender, stays, again):
-        assert not part.flow.problems
+    assert not stays.flow.problems
+    assert sender.flow.problems == ["/receiver has left in mid-session"]
+    assert again.flow.problems == [
+        f"joined /sender late: {again.input.missed} of its messages had been sent before"]
 
 
 def test_two_sinks_of_one_name_get_everything(graph):

@@ -52,7 +52,7 @@ def test_replay_through_processes_ends_by_itself_and_says_what_it_sent(bag, tmp_
         assert reader.topics["/imu/data_raw"].count == 200 and not reader.warnings
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_closes_the_recording_with_all_that_was_taken(graph, tmp_path, number):
     out = tmp_path / "out"
     recorder = start("recorder", out=out, topics="[/imu/data_raw]")
@@ -65,11 +65,11 @@ def test_signal_closes_the_recording_with_all_that_was_taken(graph, tmp_path, nu
     graph.until(lambda: flow.source.taken("/imu/data_raw") == 250)
     recorder.send_signal(number)
     code, said = end(recorder)
-    assert code == 0 and "Traceback" not in said, said
+    assert code == 128 + number and "Traceback" not in said, said
     with open_bag(out) as reader:
         assert not reader.warnings and reader.topics["/imu/data_raw"].count == 250
     graph.until(lambda: not flow.peers)  # it has said good-bye
-    assert not flow.problems
+    assert flow.problems == ["/recorder has left in mid-session"]
 
 
 def test_signal_to_the_replayer_ends_its_session(graph, bag):
@@ -79,7 +79,7 @@ def test_signal_to_the_replayer_ends_its_session(graph, bag):
     graph.until(lambda: sink.messages["/imu/data_raw"])
     replayer.send_signal(signal.SIGINT)
     graph.until(lambda: sink.ended == [END])
-    assert end(replayer)[0] == 0
+    assert end(replayer)[0] == 130
 
 
 def test_kill_9_of_the_recorder_leaves_all_closed_chunks(graph, tmp_path):
@@ -153,7 +153,8 @@ def test_a_node_closes_its_files_when_asked_to_end(tmp_path, monkeypatch, capsys
         with open(tmp_path / "logs" / "recorder.log", "a") as log:
             log.write(f"[INFO] [recorder]: {NOTICE}\n")
         nodes.process("recorder").send_signal(signal.SIGINT)
-        nodes.wait("recorder", 15.0)
+        with pytest.raises(processes.NodeError, match="recorder ended with code 130"):
+            nodes.wait("recorder", 15.0)
     assert capsys.readouterr().err == NOTICE + "\n"
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 
@@ -179,7 +180,7 @@ def test_a_long_lived_estimator_loses_nothing_of_short_recordings(bag, tmp_path)
         found.append(recorded(tmp_path / f"out{i}"))
     estimator.send_signal(signal.SIGINT)
     code, said = end(estimator)
-    assert code == 0, said
+    assert code == 130, said
     assert found[0]["/imu/data_raw"] == 200 and found[0]["/imu/mag"] == 50
     assert found[0]["/imu/data"] > 100 and found[0]["/imu/flags"] > 0
     for other in found[1:]:
@@ -209,12 +210,12 @@ def test_a_killed_estimator_that_is_started_again_stalls_nothing(graph, tmp_path
     first.communicate()
     again = start("orientation_estimator")
     code, said = end(replayer)
-    assert code == 1 and "/orientation_estimator has vanished in mid-session" in said, said
+    assert code == 3 and "/orientation_estimator has vanished in mid-session" in said, said
     code, said = end(recorder)
-    assert code == 1 and "the session of /orientation_estimator broke off" in said, said
+    assert code == 3 and "the session of /orientation_estimator broke off" in said, said
     again.send_signal(signal.SIGINT)
     code, said = end(again)
-    assert code == 1 and "joined /replayer late" in said, said
+    assert code == 130 and "joined /replayer late" in said, said
     counts = recorded(out)
     assert counts["/imu/data_raw"] == 1500 and counts["/imu/mag"] == 375
     with open_bag(out) as reader:
@@ -234,7 +235,7 @@ def test_the_recorder_ends_when_its_source_was_killed_and_says_so(graph, bag, tm
     replayer.kill()
     replayer.communicate()
     code, said = end(recorder)
-    assert code == 1 and "the session of /replayer broke off: it has vanished" in said, said
+    assert code == 3 and "the session of /replayer broke off: it has vanished" in said, said
     graph.until(lambda: sink.ended)
     done = subprocess.run([SCRIPTS / "imu_fusion", "info", out], env=ENVIRONMENT,
                           capture_output=True, text=True, timeout=60, check=False)

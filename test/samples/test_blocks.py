@@ -32,7 +32,7 @@ def expected(samples):
         guard = Guard()
         for judged in (guard.take(stamp, values), guard.finish()):
             rows += [(int(e), int(s), order.index(topic), float(v[0]))
-                     for e, s, v in zip(judged.epochs, judged.stamp, judged.values)]
+                     for e, *run in judged.runs for s, v in zip(*run)]
     return sorted(rows)
 
 

@@ -45,7 +45,8 @@ def judge(stamps, values=None, small_jumps=True):
     values = np.arange(len(stamps), dtype=float)[:, None] if values is None else values
     guard = Guard(small_jumps)
     parts = [guard.take(stamps, values), guard.finish()]
-    kept = [(int(e), (int(s) - START) / MS) for p in parts for e, s in zip(p.epochs, p.stamp)]
+    kept = [(e, (int(s) - START) / MS)
+            for p in parts for e, found, _ in p.runs for s in found]
     refused = Counter(v for p in parts for v in p.verdicts)
     assert refused == guard.counts - Counter({Verdict.OK: len(kept)})
     return kept, refused
@@ -151,7 +152,7 @@ def test_a_guard_judges_blocks_as_samples(rows, data):
             at += size
         parts.append(guard.finish())
         kept = [(int(e), int(s), float(v[0])) for p in parts
-                for e, s, v in zip(p.epochs, p.stamp, p.values)]
+                for e, *run in p.runs for s, v in zip(*run)]
         return kept, [(s, v) for p in parts for s, v in zip(p.refused_stamps, p.verdicts)], (
             guard.epoch, guard.last, guard.ends, guard.counts)
 
@@ -168,9 +169,8 @@ def test_guarding_a_log_is_guarding_its_samples(found):
     values = np.arange(3.0 * len(stamps)).reshape(-1, 3)
     kept, epochs, _ = guard_log(MagLog(stamps, values))
     guard = Guard()
-    parts = [guard.take(stamps, values), guard.finish()]
-    assert kept.stamp.tolist() == [s for p in parts for s in p.stamp.tolist()]
-    assert np.array_equal(kept.mag, np.concatenate([values[:0], *(
-        p.values for p in parts if len(p.stamp))]))
-    assert epochs.tolist() == [e for p in parts for e in p.epochs.tolist()]
+    runs = [run for part in (guard.take(stamps, values), guard.finish()) for run in part.runs]
+    assert kept.stamp.tolist() == [s for _, stamp, _ in runs for s in stamp.tolist()]
+    assert np.array_equal(kept.mag, np.concatenate([values[:0], *(found for *_, found in runs)]))
+    assert epochs.tolist() == [epoch for epoch, stamp, _ in runs for _ in stamp]
     assert JUMP == 1000 * MS

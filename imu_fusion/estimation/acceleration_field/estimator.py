@@ -209,10 +209,10 @@ class AccelerationFieldEstimator:
         if self.params.use_gyro:
             gyr = np.full((len(stamp), 3), np.nan) if gyr is None else np.asarray(gyr, dtype=float)
             flat = np.hstack([flat, gyr.reshape(len(stamp), 3)])
-        before = np.r_[[] if self._last is None else [self._last], stamp].astype(np.int64)
-        bad = np.flatnonzero(np.diff(before) <= 0)
+        before = np.append(stamp[:1] - 1 if self._last is None else self._last, stamp[:-1])
+        bad = np.flatnonzero(stamp <= before[:len(stamp)])
         if len(bad):
-            raise SampleError(f"acceleration field: stamp {before[bad[0] + 1]} ns is not later "
+            raise SampleError(f"acceleration field: stamp {stamp[bad[0]]} ns is not later "
                               f"than {before[bad[0]]} ns before it; sort and merge the samples")
         return stamp, flat
 

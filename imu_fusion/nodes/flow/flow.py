@@ -14,8 +14,8 @@ from imu_fusion.nodes.flow.source import Output, Source
 from imu_fusion.nodes.flow.state import END, State
 
 _LOOK_EVERY = 0.1  # s
-_SERVE_EVERY = 0.02  # s
-_POLL, _POLL_AT_MOST = 0.002, 0.016  # s, between looks whether all is acknowledged
+_SERVE_EVERY = 0.05  # s
+_POLL = 0.002  # s, between looks whether all is acknowledged
 
 
 class Flow:
@@ -49,7 +49,7 @@ class Flow:
         self.sink = Sink(self.peers, hold, on_begin)
         if relays:
             self.source.upstream, self.sink.feeds = self.sink.company, self.source
-        self._poll, self._serve_at = _POLL, 0.0
+        self._serve_at = 0.0
         self.peers.say()
         steady_timer(node, _LOOK_EVERY, self._look)
 
@@ -71,10 +71,6 @@ class Flow:
         turn = self.sink.take()
         if self._relays:
             self.source.lost += turn.lost
-            for session in turn.over:
-                if session.late:
-                    self.peers.problem(f"joined {session.source} late: {session.late} of its "
-                                       "messages are not in what was made of them")
         return turn
 
     def finish(self, turn: Turn) -> None:
@@ -88,25 +84,23 @@ class Flow:
         if any(not i.is_empty for i in self.sink.inputs.values() if i.sessions) and (
                 not self._relays or self.source.ready()):
             return 0.0
-        if not self.source.is_shut():
-            self._poll = _POLL
-            return idle
-        self._poll = min(2.0 * self._poll, _POLL_AT_MOST)
-        return min(idle, self._poll)
+        return idle
 
     def wait(self, executor: Executor, seconds: float) -> None:
         """Wait for something to do, at most so long, and let callbacks run.
 
         A turn of an executor looks at all that a node has, which takes longer than our work on
         a sample. So while messages come these alone are waited for, and the others have a turn
-        now and then.
+        now and then; so, too, while acknowledgements are waited for, whose coming wakes nobody.
         """
         if time.monotonic() > self._serve_at:
             self._serve_at = time.monotonic() + _SERVE_EVERY
             self.sink.gate.aside = True
             executor.spin_once(timeout_sec=0.0)
             self.sink.gate.aside = False
-        if not self.sink.wait(min(seconds, _SERVE_EVERY)):
+        if self.source.is_shut():
+            time.sleep(min(seconds, _POLL))
+        elif not self.sink.wait(min(seconds, _SERVE_EVERY)):
             executor.spin_once(timeout_sec=seconds)
 
     def close(self) -> None:

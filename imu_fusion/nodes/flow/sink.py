@@ -17,7 +17,7 @@ from imu_fusion.nodes.flow.source import Source
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT, Joined, Sending, Taken
 
 AT_ONCE = 2000  # messages of one topic that are taken in one turn
-NAP = 0.002  # s, in which a block grows
+NAP, NAP_LIVE = 0.002, 0.0003  # s, in which a block grows: what was sent together comes together
 SILENCE = 5.0  # s, after which what is missing at the end counts as lost
 REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
 REPORT_EVERY = 1.0  # s
@@ -246,8 +246,8 @@ class Sink:
 
     def take(self) -> Turn:
         """One turn: all that waits on all topics."""
-        if self.woken and self.feeding():
-            time.sleep(NAP)
+        if self.woken:
+            time.sleep(NAP if self.feeding() else NAP_LIVE)
         self.woken = False
         turn = Turn()
         if self._begun:
@@ -343,6 +343,9 @@ class Sink:
         if session.said.lost:
             self.peers.problem(f"{session.source} made its messages of incomplete data: it lacks "
                           f"at least {session.said.lost} messages")
+        if session.late:
+            self.peers.problem(f"joined {session.source} late: {session.late} of its messages had "
+                               "been sent before")
         return session.said.lost + session.late + session.broken
 
     def _compare(self, topic_input):

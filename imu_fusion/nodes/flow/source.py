@@ -229,10 +229,9 @@ class Source:
             known = self.company & self.peers.keys()
         for instance in self.company - known:
             self.company.discard(instance)
-            name, joined = self._takers.get(instance, ("", None))
-            if (joined is not None and joined.topics and not joined.finished
-                    and any(output.sent > output.start for output in self.outputs.values())):
-                self.peers.problem(f"{name} has vanished in mid-session")
+            _, joined = self._takers.get(instance, ("", None))
+            if joined is not None and not joined.finished:
+                self._miss(instance, "has vanished")
             if self.phase != _ENDED:
                 self.peers.say()
         self.advance()
@@ -243,7 +242,11 @@ class Source:
             return
         for instance, joined in self._answers().items():
             if joined is not None:
+                _, before = self._takers.get(instance, ("", None))
                 self._takers[instance] = self.peers[instance].name, joined
+                if (before is not None and joined.finished and not before.finished
+                        and self.phase in (_JOINING, _OPEN)):
+                    self._miss(instance, "has left")
         if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
             self.peers.say()
@@ -269,6 +272,12 @@ class Source:
             output.drain()
         if self._begin_after:
             self.begin()
+
+    def _miss(self, instance, how):
+        """One that had joined does not take the rest."""
+        name, joined = self._takers[instance]
+        if joined.topics and any(output.sent > output.start for output in self.outputs.values()):
+            self.peers.problem(f"{name} {how} in mid-session")
 
     def _answers(self):
         """What each of the company says of this session; None: nothing yet."""

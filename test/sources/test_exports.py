@@ -9,8 +9,8 @@ from imu_fusion import batch, cli
 from imu_fusion.messages.convert import attitude_log
 from imu_fusion.messages.layouts import ODOMETRY
 from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.importers import AVANODE_EPOCH, PHYPHOX_EPOCH
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.sources.source import EPOCH
 
 LOCATION = ('"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)",'
             '"Direction (°)","Horizontal Accuracy (m)","Vertical Accuracy (°)"\n')
@@ -54,7 +54,7 @@ def test_a_phone_s_force_is_brought_to_the_times_of_its_gyroscope(tmp_path):
     assert set(found) == {"/imu/data_raw", "/imu/mag"}
     # 5 ms lies before the first sample of the force, 55 ms after its last: both are left out.
     imu = found["/imu/data_raw"]
-    assert list(imu.stamp - PHYPHOX_EPOCH) == [15_000_000, 25_000_000, 35_000_000, 45_000_000]
+    assert list(imu.stamp - EPOCH) == [15_000_000, 25_000_000, 35_000_000, 45_000_000]
     assert imu.gyr == pytest.approx(np.array([[k, 0.2, -0.3] for k in (1, 2, 3, 4)]))
     assert imu.acc == pytest.approx(np.array([[k, -2.0, 9.81] for k in (1.5, 2.5, 3.5, 4.5)]))
     assert found["/imu/mag"].mag == pytest.approx(np.array([[2e-5, -3.5e-6, -4e-5]]), abs=1e-15)
@@ -67,7 +67,7 @@ def test_a_gap_of_the_accelerometer_is_not_bridged(tmp_path):
     gyr = ('"Time (s)","X (rad/s)","Y (rad/s)","Z (rad/s)"\n'
            + "".join(f"{t},0,0,0\n" for t in (0.015, 0.035, 0.09)))
     found = logs(phone(tmp_path / "walk", Accelerometer=text, Gyroscope=gyr), tmp_path / "out")
-    assert list(found["/imu/data_raw"].stamp - PHYPHOX_EPOCH) == [15_000_000, 35_000_000]
+    assert list(found["/imu/data_raw"].stamp - EPOCH) == [15_000_000, 35_000_000]
 
 
 def test_a_phone_s_accuracies_become_covariances_and_invalid_ones_no_fix(tmp_path):
@@ -80,7 +80,7 @@ def test_a_phone_s_accuracies_become_covariances_and_invalid_ones_no_fix(tmp_pat
     assert list(fix.status) == [0, -1, -1]
     assert np.diag(fix.cov_enu[0]) == pytest.approx([500.0 ** 2, 500.0 ** 2, 300.0 ** 2])
     assert (fix.latitude_deg[0], fix.longitude_deg[0], fix.height[0]) == (43.5, 1.4, 157.0)
-    assert list(velocity.stamp - PHYPHOX_EPOCH) == [3_000_000_000, 4_000_000_000]
+    assert list(velocity.stamp - EPOCH) == [3_000_000_000, 4_000_000_000]
     assert velocity.vel_world == pytest.approx(np.array([[2.0, 0, 0], [0, -2.0, 0]]), abs=1e-12)
     # The vertical speed is not exported: its standard deviation says that nothing is known.
     assert np.sqrt(velocity.cov_world[0, 2, 2]) >= 50.0
@@ -95,10 +95,10 @@ def test_avanode_counts_become_units_and_a_repeated_field_is_no_reading(tmp_path
                       + "#Closed reed switch for more than 2 seconds: Exit Loop\n")
     found = logs(source, tmp_path / "out")
     imu, mag = found["/imu/data_raw"], found["/imu/mag"]
-    assert list(imu.stamp - AVANODE_EPOCH) == [4294967000_000, 4294967200_000, 4294967400_000]
+    assert list(imu.stamp - EPOCH) == [4294967000_000, 4294967200_000, 4294967400_000]
     assert imu.acc[0] == pytest.approx([9.80665, 0.0, -9.80665 / 2])
     assert imu.gyr[0] == pytest.approx(np.radians([10.0, 0.0, -16 / 16.4]))
-    assert list(mag.stamp - AVANODE_EPOCH) == [4294967000_000, 4294967400_000]
+    assert list(mag.stamp - EPOCH) == [4294967000_000, 4294967400_000]
     assert mag.mag == pytest.approx(np.array([[20e-6, -10e-6, 0], [21e-6, -10e-6, 0]]))
 
 
@@ -131,7 +131,7 @@ GYROSCOPE = '"Time (s)","X (rad/s)","Y (rad/s)","Z (rad/s)"\n'
     ({"Gyroscope": GYROSCOPE + "0.02,0,0\n"}, "Gyroscope.csv, line 2: 3 cells, column 'Z'"),
     ({"Gyroscope": GYROSCOPE + ",0,0,0\n"}, "Gyroscope.csv, line 2, column 'Time'"),
     ({"Gyroscope": GYROSCOPE}, "Gyroscope.csv: no rows"),
-    ({"Gyroscope": GYROSCOPE.replace(",", ";") + "0,02;0;0;0\n"}, "Gyroscope.csv: no column"),
+    ({"Gyroscope": GYROSCOPE.replace(",", "|") + "0.02|0|0|0\n"}, "Gyroscope.csv: no column"),
     ({"Gyroscope": GYROSCOPE + "9,0,0,0\n"}, "no time in common"),
     ({"Accelerometer": GYROSCOPE.replace("rad/s", "m/s^2") + "1,0,0,9\n2,0,0,9\n2,0,0,9\n"},
      "Accelerometer.csv, line 3: no later time follows"),

@@ -3,10 +3,10 @@
 import rclpy
 import yaml
 
-from imu_fusion.nodes import acceleration_field_estimator
+from imu_fusion import nodes
 from imu_fusion.nodes.acceleration_field_estimator import AccelerationFieldEstimatorNode
-from imu_fusion.recordings.csv_import import import_csv
-from test.recordings.test_csv_import import describe, write
+from imu_fusion.recordings.convert import convert
+from test.recordings.test_array_table import describe, write
 
 
 def test_a_node_takes_the_parameter_file_of_a_table(tmp_path):
@@ -17,7 +17,7 @@ def test_a_node_takes_the_parameter_file_of_a_table(tmp_path):
         sensors[new] = sensors.pop(old)
     sensors["top"] |= {"measured_axes": ["x", "y"], "columns": ["top_x", "top_y"]}
     source, file, out = write(tmp_path, description, rows=3)
-    parameter_file, _ = import_csv(source, file, out)
+    parameter_file = convert(source, out, file).parameter_file
     rclpy.init(args=["--ros-args", "--params-file", str(parameter_file)])
     try:
         node = AccelerationFieldEstimatorNode()
@@ -35,6 +35,7 @@ def test_a_file_that_ros_cannot_parse_is_one_line(tmp_path, capsys):
     file = tmp_path / "p.yaml"
     file.write_text(yaml.safe_dump({"acceleration_field_estimator": {
         "ros__parameters": {"accelerometers": {"names": [1, "two"]}}}}))
-    assert acceleration_field_estimator.main(["--ros-args", "--params-file", str(file)]) == 1
+    assert nodes.main(["--ros-args", "--params-file", str(file)],
+                      "acceleration_field_estimator") == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("acceleration_field_estimator: ") and "p.yaml" in line

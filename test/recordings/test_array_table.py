@@ -9,7 +9,7 @@ from imu_fusion import batch, cli
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.messages.layouts import IMU
 from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.csv_import import import_csv
+from imu_fusion.recordings.convert import convert
 
 G = 9.80665
 SPIN = 5.0  # rad/s about the vertical
@@ -86,11 +86,11 @@ def test_nanosecond_stamps_are_exact_and_rates_stand_in_for_times(tmp_path):
     description = describe(time={"column": "t", "unit": "s"})
     source, file, out = write(tmp_path, description, replace=lambda text: text.replace(
         "\n0,", "\n1700000000.123456789,").replace("\n10,", "\n1700000000.133456789,"), rows=2)
-    import_csv(source, file, out)
+    convert(source, out, file)
     with open_bag(out) as reader:
         assert next(reader.messages(["/imu/data_raw"]))[2] == 1_700_000_000_123_456_789
     source, file, out = write(tmp_path, describe(time={"rate": 400.0}), rows=3)
-    import_csv(source, file, out, overwrite=True)
+    convert(source, out, file, overwrite=True)
     with open_bag(out) as reader:
         assert [m[2] for m in reader.messages(["/imu/data_raw"])] == [0, 2_500_000, 5_000_000]
 
@@ -105,7 +105,7 @@ def test_numbered_columns_white_space_and_fewer_axes(tmp_path):
     (tmp_path / "d.yaml").write_text(yaml.safe_dump(description))
     (tmp_path / "t.txt").write_text("made by\nsomebody\n" + "".join(
         f"{i * 1e-3:.3f}   " + " ".join(str(v) for v in range(12)) + "\n" for i in range(5)))
-    import_csv(tmp_path / "t.txt", tmp_path / "d.yaml", tmp_path / "bag")
+    convert(tmp_path / "t.txt", tmp_path / "bag", tmp_path / "d.yaml")
     with open_bag(tmp_path / "bag") as reader:
         _, _, values = IMU.decode(next(reader.messages(["/accelerometers/s2"]))[3])
     assert values[IMU["linear_acceleration"]].tolist() == [4.0, 0.0, 5.0]
@@ -145,6 +145,7 @@ for _k, _name in enumerate(FLAT["accelerometers"]):
     (describe(parameters={"methd": "ao"}), None, "unknown parameter 'methd'"),
     (describe(delimiter="::"), None, "delimiter '::'"),
     (describe(accelerometers={}), None, "names no accelerometers"),
+    (describe(accelerometers={}, gyroscope={}, parameters={}), None, "names no sensors"),
     (FLAT, None, "collinear"),
     (describe(), lambda t: t.replace("\n20,", "\n20,oops,", 1),
      "line 4, column 'front_x': 'oops' is not a number"),
@@ -157,7 +158,7 @@ for _k, _name in enumerate(FLAT["accelerometers"]):
 def test_what_is_wrong_is_named_and_nothing_is_written(tmp_path, description, replace, words):
     source, file, out = write(tmp_path, description, rows=5, replace=replace or (lambda t: t))
     with pytest.raises(ImuFusionError, match=words):
-        import_csv(source, file, out)
+        convert(source, out, file)
     assert not out.exists() and not (tmp_path / "bag.yaml").exists()
 
 
@@ -165,5 +166,5 @@ def test_an_existing_parameter_file_is_not_replaced_unasked(tmp_path):
     source, file, out = write(tmp_path, describe(), rows=3)
     (tmp_path / "bag.yaml").write_text("mine")
     with pytest.raises(ImuFusionError, match="bag.yaml: exists already"):
-        import_csv(source, file, out)
+        convert(source, out, file)
     assert (tmp_path / "bag.yaml").read_text() == "mine"

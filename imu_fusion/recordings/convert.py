@@ -1,0 +1,100 @@
+"""Recordings of other formats, and files of devices, as rosbag2 MCAP: whole or not at all."""
+
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from imu_fusion.errors import BagError
+from imu_fusion.parameters.bounded_yaml import read_yaml
+from imu_fusion.recordings.array_parameters import array_parameters
+from imu_fusion.recordings.bag_reader import Reader, open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.repair import copy
+from imu_fusion.recordings.targets import refuse_files, refuse_source
+from imu_fusion.sources.description import Description
+from imu_fusion.sources.source import ARRAY_TOPIC
+
+Messages = Iterable[tuple[str, str, int, bytes]]
+Watch = Callable[[Messages, int], AbstractContextManager[Messages]]
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What was written: ``counts`` of topics, the ``parameter_file`` beside it, if there is one;
+    the ``warnings`` of the source, whether it was ``damaged``, and the ``format`` that it was taken
+    for, if it is no recording."""
+
+    counts: dict[str, int]
+    parameter_file: Path | None
+    warnings: list[str]
+    damaged: bool
+    format: str
+
+
+def convert(source: str | Path, out: str | Path, description: str | Path | None = None,
+            topics: Collection[str] = (), remap: Mapping[str, str] | None = None,
+            overwrite: bool = False, watch: Watch | None = None) -> Converted:
+    """Convert what :func:`~imu_fusion.recordings.bag_reader.open_bag` opens.
+
+    Args:
+        source, description: see there. With accelerometers of an array in the description,
+            ``<out>.yaml`` becomes the parameter file of their estimator.
+        out: rosbag2 directory to write. overwrite: replace it, and the parameter file.
+        topics: those to keep; all, if empty. remap: names of ours to those in the source.
+        watch: makes a context that passes messages on, given them and how many they are.
+
+    Raises:
+        ImuFusionError: names the file with what is wrong; nothing is written then, and nothing
+            that was there is touched.
+    """
+    out = Path(out)
+    parameter_file = out.with_name(out.name + ".yaml")
+    refuse_source(source, out)
+    if description is not None:
+        refuse_source(description, out)
+    with open_bag(source, description) as reader:
+        text = "" if description is None else _array(reader, description)
+        if text:
+            refuse_files([source, description], parameter_file)
+            if parameter_file.exists() and not overwrite:
+                raise BagError(f"{parameter_file}: exists already; choose another name or "
+                               "--overwrite")
+        kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
+        renamed = {reader.require(other).name: name for name, other in (remap or {}).items()}
+        with BagWriter(out, overwrite=overwrite, whole=True) as writer:
+            messages: Messages = reader.messages(kept)
+            if watch is None:
+                copy(reader, writer, kept, renamed, messages)
+            else:
+                with watch(messages, sum(reader.topics[t].count or 0 for t in kept)) as watched:
+                    copy(reader, writer, kept, renamed, watched)
+            beside = parameter_file.with_name(f".{parameter_file.name}.part")
+            if text:
+                _write(beside, text, parameter_file)
+        if text:
+            os.replace(beside, parameter_file)
+        return Converted(dict(writer.counts), parameter_file if text else None,
+                         list(reader.warnings), reader.damaged, reader.format)
+
+
+def _array(reader: Reader, path: str | Path) -> str:
+    """The text of the parameter file; empty without an array."""
+    content = read_yaml(path)
+    if not isinstance(content, dict) or not content.get("accelerometers"):
+        return ""
+    description = Description.from_mapping(content, str(path))
+    topic = f"/{ARRAY_TOPIC}{next(iter(description.array))}"
+    stamps = np.array([stamp for _, _, stamp, _ in reader.messages([topic])], dtype=np.int64)
+    return (f"# Made from {reader.path.name} as {Path(path).name} says.\n"
+            + array_parameters(description, stamps, str(path)))
+
+
+def _write(file: Path, text: str, target: Path) -> None:
+    try:
+        file.write_text(text)
+    except OSError as error:
+        raise BagError(f"{target}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,56 @@
+"""SIGINT, SIGTERM and SIGHUP alike: what runs ends in order, with the code that shells expect."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+Handler = Callable[[int, FrameType | None], object]
+
+
+class Interrupted(BaseException):
+    """One of these signals has come. ``code``: with which the process is to end.
+
+    No KeyboardInterrupt: libraries make of that what they think right.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.code = exit_code(number)
+
+
+def exit_code(number: int) -> int:
+    """The code of a process that a signal has ended: 130, 143 or 129."""
+    return 128 + number
+
+
+def ending() -> list[signal.Signals]:
+    """The signals that end a process. Under nohup SIGHUP is none of them."""
+    return [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+
+
+@contextmanager
+def handled(handler: Handler) -> Iterator[None]:
+    """Within, these signals call ``handler``. For the main thread."""
+    before = {number: signal.signal(number, handler) for number in ending()}
+    try:
+        yield
+    finally:
+        for number, other in before.items():
+            signal.signal(number, other)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Within, signals wait: for what must not be left half done."""
+    came: list[int] = []
+    with handled(lambda number, _: came.append(number)):
+        yield
+    if came:
+        signal.raise_signal(came[0])
+
+
+def interrupt(number: int, frame: FrameType | None = None) -> None:
+    """The handler that raises :class:`Interrupted` wherever the program is."""
+    raise Interrupted(number)

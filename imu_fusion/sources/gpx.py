@@ -1,0 +1,81 @@
+"""GPX (https://www.topografix.com/GPX/1/1/): tracks, read as they come.
+
+Elevations are above sea level, as GPX has them; accuracies are not told.
+"""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from imu_fusion.errors import SampleError
+from imu_fusion.samples.logs import FixLog
+from imu_fusion.sources.source import FIX_TOPIC, FIXED, Block, Source, named
+
+
+class Gpx(Source):
+    """Track points that have a time and an elevation; others are counted."""
+
+    def __init__(self, strict: bool = True) -> None:
+        super().__init__(strict)
+        self._parser: Any = ElementTree.XMLPullParser(["end"])
+        self._part, self._seen = "", 0
+
+    def feed(self, data: bytes, part: str = "") -> list[Block]:
+        self._part = part
+        if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+            raise SampleError(f"{part}: declares entities, which no track needs")
+        try:
+            self._parser.feed(data)
+            return self._points()
+        except ElementTree.ParseError as error:
+            raise SampleError(f"{part}: no GPX ({error})") from None
+
+    def finish(self) -> list[Block]:
+        try:
+            self._parser.close()
+        except ElementTree.ParseError as error:
+            raise SampleError(f"{self._part}: ends in the middle ({error})") from None
+        blocks = self._points()
+        if not self._seen:
+            raise SampleError(f"{self._part}: no track points with time and elevation")
+        return blocks
+
+    def _points(self) -> list[Block]:
+        rows = []
+        for _, element in self._parser.read_events():
+            tag = element.tag.rpartition("}")[2]
+            if tag == "trkpt":
+                texts = {child.tag.rpartition("}")[2]: child.text for child in element}
+                if texts.get("time") and texts.get("ele"):
+                    rows.append(self._row(element, texts))
+                else:
+                    self.lost["track points without time or elevation"] += 1
+            if tag in ("trkpt", "trkseg"):
+                element.clear()
+        if not rows:
+            return []
+        self._seen += len(rows)
+        self.remark("GPX tells no accuracies, and heights above sea level")
+        lat, lon, height = np.array([row[1] for row in rows]).T
+        return named({FIX_TOPIC: FixLog(
+            np.array([row[0] for row in rows], dtype=np.int64), lat, lon, height,
+            np.zeros((len(rows), 3, 3)), np.full(len(rows), float(FIXED)))})
+
+    def _row(self, element: ElementTree.Element, texts: dict[str, str | None]
+             ) -> tuple[int, tuple[float, float, float]]:
+        text = str(texts["time"])
+        try:
+            at = datetime.fromisoformat(text.strip())
+            at = at if at.tzinfo else at.replace(tzinfo=UTC)
+            stamp = int(at.replace(microsecond=0).timestamp()) * 10**9 + at.microsecond * 1000
+            place = (float(element.attrib["lat"]), float(element.attrib["lon"]),
+                     float(str(texts["ele"])))
+        except (ValueError, KeyError, OverflowError):
+            raise SampleError(f"{self._part}: a track point at {text[:40]} has no latitude, "
+                              "longitude, elevation or time that can be read") from None
+        if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and math.isfinite(place[2])):
+            raise SampleError(f"{self._part}: track point at {text[:40]}: {place} is no place")
+        return stamp, place

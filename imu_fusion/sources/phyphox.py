@@ -1,0 +1,400 @@
+"""phyphox (https://phyphox.org): a phone's sensors, exported or asked for over its network.
+
+Exports are a folder or an archive of CSV (comma, semicolon or tab; decimal point or comma), or an
+Excel file, with a table per sensor and, from version 1.1.9 on, ``meta/time.csv`` with the phone's
+clock; without it times count from :data:`~imu_fusion.sources.source.EPOCH`. Live, the phone is
+asked for ``/config`` once, then for what is new in each buffer. All sensors of a phone have one
+clock, each its own rate: forces are brought to the stamps of the gyroscope.
+
+Nothing is made up: a position without a valid accuracy is no fix, a speed without direction no
+velocity. Accuracies are taken as standard deviations of each axis (phones mean 68 % of the circle,
+or do not say). Protocol: https://phyphox.org/wiki/index.php/Remote_interface_communication.
+"""
+
+import io
+import json
+import math
+import re
+from pathlib import PurePosixPath
+from urllib.parse import quote
+
+import numpy as np
+
+from imu_fusion.errors import SampleError
+from imu_fusion.samples.logs import FixLog, MagLog, VelocityLog
+from imu_fusion.sources.description import TableParams
+from imu_fusion.sources.pairing import Pairing
+from imu_fusion.sources.source import (
+    EPOCH,
+    FIX_TOPIC,
+    FIXED,
+    IMU_TOPIC,
+    MAG_TOPIC,
+    NO_FIX,
+    VELOCITY_TOPIC,
+    Block,
+    Source,
+    Whole,
+    named,
+)
+from imu_fusion.sources.table import UNKNOWN_CLIMB_SD, Rows, TableReader
+
+NANOSECONDS = 1_000_000_000
+# A phone's ground speed comes without accuracy; receivers are within some 0.5 m/s.
+_SPEED_SD = 0.5
+_ACCELERATION, _RATE, _FIELD = ("m/s^2", "m/s²"), ("rad/s",), ("µT", "μT")
+_SENSORS = {"accelerometer": _ACCELERATION, "gyroscope": _RATE, "magnetometer": _FIELD}
+_LINEAR = re.compile("linear|linéaire|lineare|without", re.IGNORECASE)
+# Columns of a location: names, and units (exports of iOS call that of the vertical accuracy a
+# degree; it is metres).
+_LOCATION = {"latitude": ("°",), "longitude": ("°",), "height|altitude": ("m",),
+             "velocity|speed": ("m/s",), "direction": ("°",), "horizontal accuracy": ("m",),
+             "vertical accuracy": ("m", "°")}
+_TIME_ASKED = 3    # times; versions of phyphox that do not tell count from EPOCH
+_XLS = b"\xd0\xcf\x11\xe0"
+
+
+class Phone:
+    """Readings of a phone's sensors, whose stamps are of one clock, to samples."""
+
+    def __init__(self) -> None:
+        self.pairing = Pairing()
+
+    def vectors(self, kind: str, stamp: np.ndarray, values: np.ndarray) -> list[Block]:
+        """Samples that readings (n, 3) in SI make complete; kind: accelerometer, gyroscope or
+        magnetometer."""
+        if kind == "magnetometer":
+            return named({MAG_TOPIC: MagLog(stamp, values)})
+        return named({IMU_TOPIC: self.pairing.add(**{
+            "forces" if kind == "accelerometer" else "rates": (stamp, values)})})
+
+    def finish(self) -> list[Block]:
+        """What waited for more."""
+        return named({IMU_TOPIC: self.pairing.finish()})
+
+
+def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
+    """Fixes and velocities of a phone: (n, 7) latitude and longitude in degrees, height m, speed
+    m/s, direction deg, accuracy horizontal and vertical m."""
+    lat, lon, height, speed, direction, sd_h, sd_v = values.T
+    valid = (sd_h > 0) & (sd_v > 0) & np.isfinite(sd_h) & np.isfinite(sd_v)
+    cov = np.zeros((len(stamp), 3, 3))
+    for k, sd in enumerate((sd_h, sd_h, sd_v)):
+        cov[valid, k, k] = sd[valid] ** 2
+    there = np.isfinite(values[:, :3]).all(axis=1)
+    fixes = FixLog(stamp, lat, lon, height, cov, np.where(valid, FIXED, NO_FIX))[there]
+    course = np.radians(direction)    # clockwise from north
+    moves = (speed >= 0) & (direction >= 0)
+    vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
+    cov = np.tile(np.diag([_SPEED_SD, _SPEED_SD, UNKNOWN_CLIMB_SD]) ** 2, (len(stamp), 1, 1))
+    return named({FIX_TOPIC: fixes, VELOCITY_TOPIC: VelocityLog(stamp, vel, cov)[moves]})
+
+
+class PhyphoxExport(Source):
+    """A folder, archive or Excel file."""
+
+    def __init__(self, strict: bool = True) -> None:
+        super().__init__(strict)
+        self._whole = Whole()
+
+    def feed(self, data: bytes, part: str = "") -> list[Block]:
+        self._whole.add(part, data)
+        return []
+
+    def finish(self) -> list[Block]:
+        sheets = dict(_sheets(self._whole.parts))
+        clock = _clock(sheets.pop("time", None))
+        if clock is None:
+            self.remark("the export has no meta/time.csv: stamps begin at an arbitrary instant")
+        sheets.pop("device", None)
+        phone, blocks = Phone(), []
+        for name, sheet in sheets.items():
+            kind = _kind(name, sheet)
+            if kind == "location":
+                time, values = sheet.read(_LOCATION)
+                sheet.check_degrees(values)
+                blocks += locations(_stamps(sheet, time, clock), values)
+            elif kind:
+                time, values = sheet.read({axis: _SENSORS[kind] for axis in "xyz"})
+                if kind == "accelerometer":
+                    sheet.check_rising(time)
+                values = values * (1e-6 if kind == "magnetometer" else 1.0)
+                blocks += phone.vectors(kind, _stamps(sheet, time, clock), values)
+        blocks += phone.finish()
+        if phone.pairing.left_out and not any(block.topic == IMU_TOPIC for block in blocks):
+            names = " and ".join(n for n in sheets if _kind(n, sheets[n]) in (
+                "accelerometer", "gyroscope"))
+            raise SampleError(f"{names} have no time in common")
+        if phone.pairing.left_out:
+            self.remark(f"{phone.pairing.left_out} rates without a force beside them are left out")
+        return blocks
+
+
+class _Sheet:
+    """One table of an export: its name in errors, and its columns."""
+
+    def __init__(self, where: str, reader: TableReader, rows: Rows) -> None:
+        self.where, self.rows, self._reader = where, rows, reader
+        self.names = reader.names or []
+        if len(rows.lines) < 1:
+            raise SampleError(f"{where}: no rows of numbers")
+
+    def read(self, wanted: dict[str, tuple[str, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        """(times (n,) in s, values (n, k)) of the columns 'name (unit)'."""
+        names = [self._name("time|zeit|temps", ("s",)) if "time" in self.names[0].lower()
+                 else self.names[0], *(self._name(*item) for item in wanted.items())]
+        time, *values = (self.column(name) for name in names)
+        return time, np.column_stack(values)
+
+    def column(self, name: str) -> np.ndarray:
+        """(n,) numbers of a column, which errors call by its name without the unit."""
+        texts = self._reader.pointed(self._reader.texts(self.rows, name, _bare(name)))
+        return self._reader.numbers(self.rows, _bare(name), texts)
+
+    def check_rising(self, time: np.ndarray) -> None:
+        """The times of the forces must rise."""
+        step = np.diff(time)
+        if len(step) == 0 or (step <= 0).any():
+            line = self.rows.lines[int(np.argmax(np.r_[step <= 0, True]))]
+            raise SampleError(f"{self.where}, line {line}: no later time follows")
+
+    def check_degrees(self, values: np.ndarray) -> None:
+        """Latitude and longitude."""
+        bad = (np.abs(values[:, 0]) > 90) | (np.abs(values[:, 1]) > 360)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise SampleError(f"{self.where}, line {self.rows.lines[k]}: latitude "
+                              f"{values[k, 0]:g}, longitude {values[k, 1]:g} are not degrees")
+
+    def _name(self, wanted: str, permitted: tuple[str, ...]) -> str:
+        found = None
+        # Newer exports write 'Acceleration x (m/s^2)'.
+        prefix = "(?:.* )?" if len(wanted) == 1 else ""
+        for name in self.names:
+            match = re.fullmatch(rf"{prefix}(?:{wanted})\s*\((.*)\)", name, re.IGNORECASE)
+            if match and match[1] in permitted:
+                return name
+            found = match[1] if match else found
+        label = wanted.partition("|")[0].title()
+        if found is not None:
+            raise SampleError(f"{self.where}: column '{label}' is in '{found}', expected "
+                              + " or ".join(permitted))
+        raise SampleError(f"{self.where}: no column '{label}'; there are: "
+                          + ", ".join(self.names))
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"\s*\([^()]*\)$", "", name)
+
+
+def _sheets(parts):
+    """(name without folder and suffix, _Sheet) of the tables of an export."""
+    for part, data in parts.items():
+        data, path = bytes(data), PurePosixPath(part)
+        if data.startswith((_XLS, b"PK")):
+            yield from _excel(part, data)
+        elif path.suffix.lower() == ".csv":
+            reader = TableReader(_dialect(data), part)
+            rows = reader.feed(data + b"\n")
+            yield path.stem if path.parent.name == "meta" else str(path), _Sheet(part, reader, rows)
+
+
+def _dialect(data: bytes) -> TableParams:
+    """phyphox writes comma, semicolon or tab; a decimal comma stands between digits."""
+    first, _, rest = data.partition(b"\n")
+    delimiter = next((d for d in ("\t", ";") if d in first.decode("utf-8", "replace")), ",")
+    comma = delimiter != "," and re.search(rb"\d,\d", rest[:4096]) is not None
+    return TableParams(delimiter={"\t": "tab"}.get(delimiter, delimiter),
+                       decimal="," if comma else ".")
+
+
+def _excel(part: str, data: bytes):
+    try:
+        from python_calamine import CalamineWorkbook
+    except ImportError:
+        raise SampleError(f"{part}: reading Excel files needs python-calamine: pip install "
+                          "'imu_fusion[devices]', or export CSV instead") from None
+    try:
+        book = CalamineWorkbook.from_filelike(io.BytesIO(data))
+        tables = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
+    except Exception as error:    # of the library: it has no common root
+        raise SampleError(f"{part}: no Excel file that can be read ({error})") from None
+    for name, rows in tables.items():
+        text = "\n".join("\t".join(str(cell).replace("\t", " ").replace("\n", " ") for cell in row)
+                         for row in rows)
+        reader = TableReader(TableParams(delimiter="tab"), f"{part}, sheet {name}")
+        found = reader.feed(text.encode() + b"\n")
+        if found.lines:
+            meta = {"Metadata Time": "time", "Metadata Device": "device"}.get(name, name)
+            yield meta, _Sheet(f"{part}, sheet {name}", reader, found)
+
+
+def _kind(name: str, sheet: _Sheet) -> str:
+    """What a table holds: a key of _SENSORS, location, or '' for nothing that is used."""
+    text = " ".join((PurePosixPath(name).stem, *sheet.names))
+    if re.search("latitude", text, re.IGNORECASE):
+        return "location"
+    if _LINEAR.search(text):
+        return ""
+    for kind, stem in (("accelerometer", "acc|beschleu"), ("gyroscope", "gyr"),
+                       ("magnetometer", "mag")):
+        if re.search(stem, text, re.IGNORECASE):
+            return kind
+    return ""
+
+
+def _clock(sheet: _Sheet | None) -> list[tuple[float, int]] | None:
+    """(experiment time s, Unix time of its zero in ns) from which each stretch of measuring
+    counts: the phone's clock goes on while it pauses."""
+    if sheet is None or "event" not in sheet.names:
+        return None
+    names = [next((n for n in sheet.names if n.startswith(wanted)), "")
+             for wanted in ("event", "experiment time", "system time")]
+    if not all(names):
+        return None
+    events = [row[sheet.names.index("event")] for row in sheet.rows.cells]
+    since, unix = sheet.column(names[1]), sheet.column(names[2])
+    starts = [(float(t), round(u * 1000) * 1_000_000 - round(t * NANOSECONDS))
+              for event, t, u in zip(events, since, unix)
+              if event == "START" and math.isfinite(t) and math.isfinite(u) and u > 1e8]
+    return starts or None
+
+
+def _stamps(sheet: _Sheet, time: np.ndarray, clock: list[tuple[float, int]] | None) -> np.ndarray:
+    bad = ~((time >= 0) & (time < 1e9))
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise SampleError(f"{sheet.where}, line {sheet.rows.lines[k]}, column 'Time': {time[k]:g} "
+                          "s is not a time since the start of the experiment")
+    zeros = clock or [(0.0, EPOCH)]
+    stretch = np.clip(np.searchsorted([t for t, _ in zeros], time, "right") - 1, 0, None)
+    return np.array([zero for _, zero in zeros])[stretch] + np.round(
+        time * NANOSECONDS).astype(np.int64)
+
+
+class PhyphoxLive(Source):
+    """The remote interface of a running experiment: feed it what was asked for, under the path
+    that :meth:`request` gave."""
+
+    def __init__(self, strict: bool = False) -> None:
+        super().__init__(strict)
+        self.restart()
+
+    def restart(self) -> None:
+        """Ask anew which buffers there are."""
+        self._phone = Phone()
+        self._buffers: dict[str, dict[str, str]] = {}    # sensor -> {output: buffer}
+        self._last: dict[str, float] = {}                # sensor -> time of its last reading
+        self._session = ""
+        self._measures = False
+        self._asked_time = 0     # how often since it was started
+        self._zero: int | None = None
+
+    def request(self) -> str | None:
+        if not self._buffers:
+            return "/config"
+        if self._zero is None and self._measures and self._asked_time < _TIME_ASKED:
+            return "/time"
+        parts = []
+        for sensor, outputs in self._buffers.items():
+            time = outputs["t"]
+            last = self._last.get(sensor)
+            after = "full" if last is None else repr(last)
+            parts.append(f"{quote(time)}={after}")
+            parts += [f"{quote(name)}={after}" + (f"%7C{quote(time)}" if last is not None else "")
+                      for output, name in outputs.items() if output != "t"]
+        return "/get?" + "&".join(parts)
+
+    def feed(self, data: bytes, part: str = "") -> list[Block]:
+        self._asked_time += part.startswith("/time")
+        try:
+            answer = json.loads(data)
+            if part.startswith("/config"):
+                self._learn(answer)
+            elif part.startswith("/time"):
+                self._set_clock(answer)
+            elif part.startswith("/get"):
+                return self._readings(answer)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            if isinstance(error, SampleError):
+                raise
+            self.lose("answers that are not phyphox's", part[:20])
+        return []
+
+    def finish(self) -> list[Block]:
+        return self._phone.finish()
+
+    def _learn(self, config):
+        known = {"accelerometer": "xyzt", "gyroscope": "xyzt", "magnetic_field": "xyzt"}
+        for entry in config["inputs"]:
+            outputs = {output: str(name) for pair in entry["outputs"]
+                       for output, name in pair.items() if output != "abs"}
+            source = str(entry["source"])
+            if source in known and set(known[source]) <= outputs.keys():
+                self._buffers[source] = {axis: outputs[axis] for axis in known[source]}
+            elif source == "location" and {"lat", "lon", "t"} <= outputs.keys():
+                self._buffers[source] = outputs
+        if not self._buffers:
+            raise SampleError("the running experiment of phyphox has none of accelerometer, "
+                              "gyroscope, magnetometer and location with times: open one that has, "
+                              "such as config/imu_fusion.phyphox")
+        self.device = f"phyphox: {config.get('title', '')}"[:80]
+
+    def _set_clock(self, events):
+        starts = [e for e in events if e.get("event") == "START"]
+        if starts:
+            last = starts[-1]
+            self._zero = (round(float(last["systemTime"]) * 1000) * 1_000_000
+                          - round(float(last["experimentTime"]) * NANOSECONDS))
+
+    def _readings(self, answer):
+        status = answer.get("status", {})
+        session = str(status.get("session", ""))
+        if self._session and session != self._session:
+            self._begin_anew("sessions of phyphox that were left: the experiment began anew")
+        self._session = session
+        measures = bool(status.get("measuring"))
+        if measures and not self._measures:
+            self._zero, self._asked_time = None, 0    # started, or gone on with after a pause
+        self._measures = measures
+        if self._zero is None and (not measures or self._asked_time < _TIME_ASKED):
+            return []    # the readings are asked for again when their zero is known
+        blocks: list[Block] = []
+        arrays = {name: np.array([np.nan if not isinstance(v, (int, float)) else v
+                                  for v in entry["buffer"]], dtype=np.float64)
+                  for name, entry in answer["buffer"].items()}
+        for sensor, outputs in self._buffers.items():
+            time = arrays.get(outputs["t"])
+            if time is None or not len(time):
+                continue
+            last = self._last.get(sensor)
+            if last is not None and time[-1] < last:
+                self._begin_anew("stretches of phyphox that were left: it was cleared")
+                last = None
+            columns = {o: arrays.get(name, np.empty(0)) for o, name in outputs.items()}
+            # A reading may have reached some of its buffers when the phone answers.
+            n = min(len(c) for o, c in columns.items() if len(c) or o in "xyzt")
+            new = np.flatnonzero(np.isfinite(time[:n]) & (time[:n] > (
+                -np.inf if last is None else last)))
+            if len(new):
+                self._last[sensor] = float(time[new[-1]])
+                blocks += self._samples(sensor, time[new], {
+                    o: c[new] for o, c in columns.items() if len(c) >= n})
+        return blocks
+
+    def _samples(self, sensor, time, columns):
+        stamp = (EPOCH if self._zero is None else self._zero) + np.round(
+            time * NANOSECONDS).astype(np.int64)
+        if sensor == "location":
+            none = np.full(len(time), np.nan)
+            height = "zwgs84" if "zwgs84" in columns else "z"
+            return locations(stamp, np.column_stack([columns.get(name, none) for name in (
+                "lat", "lon", height, "v", "dir", "accuracy", "zAccuracy")]))
+        values = np.column_stack([columns[axis] for axis in "xyz"])
+        if sensor == "magnetic_field":
+            return self._phone.vectors("magnetometer", stamp, values * 1e-6)
+        return self._phone.vectors(sensor, stamp, values)
+
+    def _begin_anew(self, why):
+        self.lost[why] += 1
+        self._phone, self._last, self._zero, self._asked_time = Phone(), {}, None, 0

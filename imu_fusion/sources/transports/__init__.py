@@ -1,0 +1,1 @@
+"""How bytes come here: files, archives, ports and the network. Nothing here knows a format."""

@@ -1,0 +1,153 @@
+"""PX4's ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html), read by pyulog.
+
+PX4's body axes are forward, right, down and its world north, east, down; samples are given forward,
+left, up and east, north, up. Times count from boot; where the receiver knew UTC they are brought
+to it, else they count from :data:`~imu_fusion.sources.source.EPOCH`.
+"""
+
+import io
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.errors import SampleError
+from imu_fusion.samples.logs import FixLog, MagLog, PoseLog, VelocityLog
+from imu_fusion.sources.pairing import Pairing
+from imu_fusion.sources.source import (
+    EPOCH,
+    FIX_TOPIC,
+    FIXED,
+    IMU_TOPIC,
+    MAG_TOPIC,
+    NO_FIX,
+    VELOCITY_TOPIC,
+    Block,
+    Source,
+    Whole,
+    named,
+)
+
+MAGIC = b"ULog\x01\x12\x35"
+ONBOARD_TOPIC = "onboard_ekf/pose"
+_FLU_FRD = np.array([1.0, -1.0, -1.0])
+_ENU_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_NO_FORCE = 0x7FFFFFFF    # as accelerometer_timestamp_relative
+_GAUSS = 1e-4
+_FIX_3D = 3
+_WANTED = ["sensor_combined", "vehicle_magnetometer", "sensor_mag", "vehicle_gps_position",
+           "sensor_gps", "vehicle_attitude"]
+
+
+class Ulog(Source):
+    """A whole log."""
+
+    def __init__(self, strict: bool = True) -> None:
+        super().__init__(strict)
+        self._whole = Whole()
+        self._part = ""
+
+    def feed(self, data: bytes, part: str = "") -> list[Block]:
+        self._part = part
+        self._whole.add("", data)
+        return []
+
+    def finish(self) -> list[Block]:
+        try:
+            from pyulog import ULog
+        except ImportError:
+            raise SampleError(f"{self._part}: reading ULog needs pyulog: pip install "
+                              "'imu_fusion[devices]'") from None
+        try:
+            log = ULog(io.BytesIO(bytes(self._whole.parts.get("", b""))), _WANTED)
+        except Exception as error:    # of the library: damage shows in any way
+            raise SampleError(f"{self._part}: damaged beyond reading ({type(error).__name__}: "
+                              f"{error})") from None
+        if log.file_corruption:
+            self.lost["parts of the log that are damaged"] += 1
+        if log.dropouts:
+            gone = sum(d.duration for d in log.dropouts) * 1e-3
+            self.remark(f"the logger dropped out {len(log.dropouts)} times, {gone:.1f} s in all")
+        self.device = f"PX4 {log.msg_info_dict.get('ver_hw', '')}"[:80]
+        sets: dict[str, dict[str, np.ndarray]] = {}
+        for dataset in log.data_list:
+            if len(dataset.data.get("timestamp", ())):
+                sets.setdefault(dataset.name, dataset.data)
+        return self._blocks(sets)
+
+    def _blocks(self, sets: dict[str, dict[str, np.ndarray]]) -> list[Block]:
+        gps = sets.get("vehicle_gps_position") or sets.get("sensor_gps")
+        zero = self._zero(gps)
+        blocks: list[Block] = []
+        imu = sets.get("sensor_combined")
+        if imu is not None:
+            stamp = _stamps(imu["timestamp"], zero)
+            late = imu["accelerometer_timestamp_relative"].astype(np.int64)
+            there = late != _NO_FORCE
+            pairing = Pairing()
+            paired = [pairing.add(
+                ((stamp + 1000 * late)[there],
+                 (_vector(imu, "accelerometer_m_s2") * _FLU_FRD)[there]),
+                (stamp, _vector(imu, "gyro_rad") * _FLU_FRD)), pairing.finish()]
+            blocks += [block for log in paired for block in named({IMU_TOPIC: log})]
+        mag = sets.get("vehicle_magnetometer")
+        if mag is not None:
+            blocks += named({MAG_TOPIC: MagLog(_stamps(mag["timestamp"], zero), _vector(
+                mag, "magnetometer_ga") * _FLU_FRD * _GAUSS)})
+        elif "sensor_mag" in sets:
+            mag = sets["sensor_mag"]
+            values = np.column_stack([mag[axis] for axis in "xyz"]).astype(np.float64)
+            blocks += named({MAG_TOPIC: MagLog(_stamps(mag["timestamp"], zero),
+                                               values * _FLU_FRD * _GAUSS)})
+        if gps is not None:
+            blocks += _gnss(gps, zero)
+        attitude = sets.get("vehicle_attitude")
+        if attitude is not None:
+            quat = _vector(attitude, "q", 4)[:, [1, 2, 3, 0]]
+            fine = np.linalg.norm(quat, axis=1) > 0.5
+            stamp = _stamps(attitude["timestamp"], zero)[fine]
+            body = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])    # half a turn about forward
+            found = (_ENU_NED * Rotation.from_quat(quat[fine]) * body).as_quat()
+            blocks += named({ONBOARD_TOPIC: PoseLog(stamp, found, np.zeros((len(stamp), 3)))})
+        if not blocks:
+            raise SampleError(f"{self._part}: none of {', '.join(_WANTED)} was logged")
+        return blocks
+
+    def _zero(self, gps: dict[str, np.ndarray] | None) -> int:
+        """UTC of boot in ns."""
+        if gps is not None:
+            utc, boot = (gps[n].astype(np.int64) for n in ("time_utc_usec", "timestamp"))
+            known = utc > 1_000_000_000_000_000
+            if known.any():
+                return int(np.median(utc[known] - boot[known])) * 1000
+        self.remark("the receiver never knew UTC: stamps begin at an arbitrary instant")
+        return EPOCH
+
+
+def _stamps(boot: np.ndarray, zero: int) -> np.ndarray:
+    return zero + 1000 * boot.astype(np.int64)
+
+
+def _vector(data: dict[str, Any], name: str, size: int = 3) -> np.ndarray:
+    return np.column_stack([data[f"{name}[{k}]"] for k in range(size)]).astype(np.float64)
+
+
+def _gnss(gps: dict[str, np.ndarray], zero: int) -> list[Block]:
+    """Fixes and velocities, with the accuracies that the receiver reports."""
+    stamp = _stamps(gps["timestamp"], zero)
+    if "latitude_deg" in gps:    # from PX4 1.14 on
+        lat, lon, height = (gps[n] for n in ("latitude_deg", "longitude_deg",
+                                             "altitude_ellipsoid_m"))
+    else:
+        lat, lon, height = gps["lat"] * 1e-7, gps["lon"] * 1e-7, gps["alt_ellipsoid"] * 1e-3
+    fixed = gps["fix_type"] >= _FIX_3D
+    sd = np.column_stack([gps["eph"], gps["eph"], gps["epv"]]).astype(np.float64)
+    cov = np.zeros((len(stamp), 3, 3))
+    known = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
+    cov[known] = sd[known, :, None] ** 2 * np.eye(3)
+    vel = np.column_stack([gps["vel_e_m_s"], gps["vel_n_m_s"], -gps["vel_d_m_s"]])
+    speed_sd = gps["s_variance_m_s"].astype(np.float64)    # a standard deviation, despite its name
+    cov_vel = np.where(speed_sd > 0, speed_sd, 0.0)[:, None, None] ** 2 * np.eye(3)
+    return named({FIX_TOPIC: FixLog(stamp, lat, lon, height, cov,
+                                    np.where(fixed, FIXED, NO_FIX)),
+                  VELOCITY_TOPIC: VelocityLog(stamp, vel, cov_vel)[fixed]})

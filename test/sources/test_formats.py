@@ -1,0 +1,321 @@
+"""Each format against what its documentation, or an independent writer, says."""
+
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+import openpyxl
+import pytest
+from pyubx2 import GET, UBXMessage
+
+from imu_fusion.errors import ImuFusionError, SampleError
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.logs import read_log
+from imu_fusion.sources.gnss import Receiver
+from imu_fusion.sources.phyphox import PhyphoxExport, PhyphoxLive
+from imu_fusion.sources.sensor_logger import SensorLoggerExport, SensorLoggerPush
+from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
+from imu_fusion.sources.ximu3 import Ximu3
+from test.sources.logs import read, same, together
+from test.sources.test_splitting import escaped, nmea, solution
+
+
+def test_a_solution_of_a_u_blox_is_utc_degrees_and_east_north_up():
+    message = UBXMessage(
+        "NAV", "NAV-PVT", GET, year=2022, month=2, day=22, hour=7, min=51, second=37,
+        nano=-100_000_000, validDate=1, validTime=1, fixType=3, gnssFixOk=1, lat=47.3119640,
+        lon=11.3832481, height=2_321_428, hAcc=1500, vAcc=2500, velN=35, velE=29, velD=27, sAcc=400)
+    found = read(Receiver(), message.serialize())
+    fix, velocity = found["fix"], found["fix_velocity"]
+    assert fix.stamp[0] == 1645516297_000_000_000 - 100_000_000    # date -u -d ... +%s
+    assert (fix.latitude_deg[0], fix.longitude_deg[0]) == pytest.approx((47.3119640, 11.3832481))
+    assert fix.height[0] == pytest.approx(2321.428) and fix.status[0] == 0
+    assert np.diag(fix.cov_enu[0]) == pytest.approx([1.5**2, 1.5**2, 2.5**2])
+    assert velocity.vel_world[0] == pytest.approx([0.029, 0.035, -0.027])
+    assert np.diag(velocity.cov_world[0]) == pytest.approx([0.16] * 3)
+
+
+def test_a_u_blox_without_fix_says_so_and_has_no_velocity():
+    message = UBXMessage("NAV", "NAV-PVT", GET, year=2022, month=2, day=22, validDate=1,
+                         validTime=1, fixType=2, gnssFixOk=1)
+    found = read(Receiver(), message.serialize())
+    assert list(found["fix"].status) == [-1] and "fix_velocity" not in found
+
+
+def test_nmea_is_ellipsoidal_and_its_accuracies_come_from_gst():
+    data = (nmea("GPRMC,083600.50,A,4717.11437,N,00833.91522,W,10.0,90.0,091202,,,A")
+            + nmea("GPGGA,083600.50,4717.11437,N,00833.91522,W,1,08,1.01,499.6,M,48.0,M,,")
+            + nmea("GPGST,083600.50,,,,,2.0,3.0,4.0"))
+    found = read(Receiver(), data)
+    fix, velocity = found["fix"], found["fix_velocity"]
+    assert fix.stamp[0] == 1039422960_500_000_000    # 2002-12-09 08:36:00.5 UTC
+    assert fix.latitude_deg[0] == pytest.approx(47 + 17.11437 / 60)
+    assert fix.longitude_deg[0] == pytest.approx(-(8 + 33.91522 / 60))
+    assert fix.height[0] == pytest.approx(547.6)
+    assert np.diag(fix.cov_enu[0]) == pytest.approx([9.0, 4.0, 16.0])    # east, north, up
+    assert velocity.vel_world[0] == pytest.approx([10 * 1852 / 3600, 0.0, 0.0], abs=1e-9)
+    assert velocity.cov_world[0, 2, 2] > 50**2    # nothing is known of the vertical
+
+
+def test_nmea_beside_ubx_adds_nothing_twice():
+    data = solution(1) + nmea("GPGGA,050601.00,4717.1,N,00833.9,E,1,08,1.0,499.6,M,48.0,M,,"
+                              ) + solution(2)
+    assert len(read(Receiver(), data)["fix"]) == 2
+
+
+def test_x_imu3_binary_and_text_say_the_same():
+    values = 1.5, -2.5, 90.0, 0.0, 0.5, 1.0
+    us = 0x0A0ADBDB    # bytes that are escaped
+    binary = read(Ximu3(), escaped(struct.pack("<BQ6f", 0xC9, us, *values)))
+    text = read(Ximu3(), b"I,%d,1.5,-2.5,90,0,.5,1\r\n" % us)
+    assert same(binary, text)
+    imu = binary["imu/data_raw"]
+    assert imu.stamp[0] == EPOCH + 1000 * us
+    assert imu.gyr[0] == pytest.approx(np.radians([1.5, -2.5, 90.0]))
+    assert imu.acc[0] == pytest.approx([0.0, 4.903325, 9.80665])
+
+
+PHONE = {"Accelerometer": ("Acceleration", "m/s^2", 0.01, 0.0, (0.1, -2.5, 9.75)),
+         "Gyroscope": ("Gyroscope", "rad/s", 0.012, 0.004, (0.25, 0.5, -1.5)),
+         "Magnetometer": ("Magnetic field", "µT", 0.02, 0.0, (20.0, -3.5, -40.0))}
+TIME = ('"event","experiment time","system time","system time text"\n'
+        '"START",0.0E0,1770000000.250,"2026-02-02"\n"PAUSE",.5E0,1770000000.750,""\n'
+        '"START",.5E0,1770000100.750,""\n')
+
+
+def readings(step, start, first):
+    """(times, rows) of one sensor of a phone for a second; values of 9 digits."""
+    times = np.round(start + step * np.arange(int(1 / step)), 9)
+    return times, np.round(np.array(first) + np.outer(np.sin(7 * times), [0.3, 0.2, 0.1]), 7)
+
+
+def export(delimiter=",", decimal=".", clock=TIME, long_names=True):
+    """{part: bytes} of a phyphox export."""
+    def cell(v):
+        return f"{v:.9E}".replace(".", decimal)
+
+    files = {}
+    for name, (label, unit, step, start, first) in PHONE.items():
+        times, rows = readings(step, start, first)
+        prefix = f"{label} " if long_names else ""
+        axes = "xyz" if long_names else "XYZ"
+        lines = [delimiter.join(['"Time (s)"', *(f'"{prefix}{a} ({unit})"' for a in axes)])]
+        lines += [delimiter.join(map(cell, (t, *row))) for t, row in zip(times, rows)]
+        files[f"walk/{name}.csv"] = "\n".join(lines).encode() + b"\n"
+    if clock:
+        files["walk/meta/time.csv"] = clock.encode()
+    return files
+
+
+def read_parts(source, files):
+    blocks = [block for part, data in files.items() for block in source.feed(data, part)]
+    return together(blocks + source.finish())
+
+
+def test_all_dialects_of_phyphox_are_equal_and_its_clock_goes_on_in_a_pause():
+    expected = read_parts(PhyphoxExport(), export())
+    for delimiter, decimal in ((";", ","), ("\t", "."), ("\t", ","), (";", ".")):
+        assert same(read_parts(PhyphoxExport(), export(delimiter, decimal)), expected)
+    assert same(read_parts(PhyphoxExport(), export(long_names=False)), expected)
+    mag = expected["imu/mag"]
+    assert mag.stamp[0] == 1770000000_250_000_000
+    assert mag.stamp[-1] == 1770000100_250_000_000 + 980_000_000
+    assert np.linalg.norm(mag.mag, axis=1) == pytest.approx(np.full(50, 44.9e-6), abs=1e-6)
+
+
+def test_an_excel_export_is_read_by_its_library(tmp_path):
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for part, data in export(delimiter=";").items():
+        name = "Metadata Time" if part.endswith("time.csv") else part[5:-4]
+        sheet = book.create_sheet(name)
+        for line in data.decode().splitlines():
+            cells = [c.strip('"') for c in line.split("," if "time.csv" in part else ";")]
+            sheet.append([float(c) if is_number(c) else c for c in cells])
+    book.save(tmp_path / "walk.xlsx")
+    found = read_parts(PhyphoxExport(), {"walk.xlsx": (tmp_path / "walk.xlsx").read_bytes()})
+    assert same(found, read_parts(PhyphoxExport(), export()))
+
+
+class Server:
+    """phyphox's remote interface, as its documentation words it: answers to paths."""
+
+    def __init__(self, clock=1770000000.25):
+        self.buffers, self.outputs = {}, {}
+        for source, name in (("accelerometer", "Accelerometer"), ("gyroscope", "Gyroscope"),
+                             ("magnetic_field", "Magnetometer")):
+            times, rows = readings(*PHONE[name][2:])
+            for axis, values in zip("xyzt", (*rows.T, times)):
+                self.buffers[f"{source[:3]}{axis}"] = values
+            self.outputs[source] = [{axis: f"{source[:3]}{axis}"} for axis in "xyzt"]
+        self.clock, self.session, self.now, self.measuring = clock, "aa11", 0.0, True
+
+    def answer(self, path):
+        if path == "/config":
+            return {"title": "All", "inputs": [{"source": s, "outputs": o}
+                                               for s, o in self.outputs.items()]}
+        if path == "/time":
+            return [{"event": "START", "experimentTime": 0.0, "systemTime": self.clock}]
+        buffers = {}
+        for item in path.partition("?")[2].split("&"):
+            name, _, wanted = item.partition("=")
+            threshold, _, reference = wanted.partition("%7C")
+            times = self.buffers[(reference or name)[:3] + "t"]
+            shown = times <= self.now
+            if threshold != "full":
+                shown &= times > float(threshold)
+            buffers[name] = {"size": 0, "updateMode": "full" if threshold == "full" else "partial",
+                             "buffer": [float(v) for v in self.buffers[name][shown]]}
+        return {"buffer": buffers, "status": {"session": self.session,
+                                              "measuring": self.measuring}}
+
+
+def poll(source, server):
+    path = source.request()
+    return source.feed(json.dumps(server.answer(path)).encode(), path)
+
+
+@pytest.mark.parametrize("step", [0.03, 0.25, 2.0])
+def test_what_phyphox_told_live_is_what_it_exports(step):
+    source, server = PhyphoxLive(), Server()
+    blocks = poll(source, server)
+    for k in range(int(1 / step) + 6):
+        server.now = k * step
+        blocks += poll(source, server)
+    found = together(blocks + source.finish())
+    start_only = "\n".join(TIME.splitlines()[:2])
+    assert same(found, read_parts(PhyphoxExport(), export(clock=start_only)))
+    assert not source.lost and "All" in source.device
+
+
+def test_phyphox_cleared_begins_anew_and_broken_answers_are_counted():
+    source, server = PhyphoxLive(), Server()
+    for now in (0.0, 0.2, 0.4, 0.6):
+        server.now = now
+        poll(source, server)
+    server.session, server.now = "bb22", 0.1
+    source.feed(b"<html>404</html>", "/get?x")
+    for _ in range(3):
+        again = poll(source, server)
+    stamps = together(again or poll(source, server))
+    assert sum(source.lost.values()) == 2
+    assert all(log.stamp[0] <= 1770000000_350_000_000 for log in stamps.values())
+
+
+def sensor_logger(platform="ios", standardised=False, **without):
+    """{part: bytes} of a Sensor Logger export; the phone lies flat, its top is pushed."""
+    times = 1_698_501_144_401_773_000 + 10_000_000 * np.arange(60)
+    sign = -1.0 if platform == "ios" and not standardised else 1.0
+    head = "time,seconds_elapsed,z,y,x\n"
+
+    def rows(value, shift=0):
+        return head + "".join(f"{t + shift},{1e-2 * k},{value[2]},{value[1]},{value[0]}\n"
+                              for k, t in enumerate(times))
+
+    meta = ("version,device name,recording epoch time,platform,appVersion,standardisation\n"
+            f"3,Phone,1698501144400,{platform},1.64,{str(standardised).lower()}\n")
+    files = {
+        "Metadata": meta, "Accelerometer": rows([0.0, sign * 0.5, 0.0]),
+        "Gravity": rows([0.0, 0.0, sign * STANDARD_GRAVITY]),
+        "Gyroscope": rows([0.1, 0.2, 0.3], 3_000_000),
+        "Magnetometer": rows([20.0, 0.0, -40.0]),
+        "Location": "time,seconds_elapsed,bearingAccuracy,speedAccuracy,verticalAccuracy,"
+                    "horizontalAccuracy,speed,bearing,altitude,longitude,latitude\n"
+                    f"{times[0] - 90_000_000_000},-90,1,1,1,1,0,0,1,1,1\n"
+                    f"{times[5]},.05,1,.5,3,2,4,90,500.5,8.5,47.5\n"
+                    f"{times[9]},.09,-1,-1,-1,-1,-1,-1,500.5,8.5,47.5\n"}
+    return {f"log/{name}.csv": text.encode() for name, text in files.items()
+            if name not in without.get("without", ())}
+
+
+@pytest.mark.parametrize("platform, standardised", [
+    ("ios", False), ("ios", True), ("android", False)])
+def test_a_phone_that_lies_flat_feels_g_upwards_on_either_system(platform, standardised):
+    source = SensorLoggerExport()
+    found = read_parts(source, sensor_logger(platform, standardised))
+    imu = found["imu/data_raw"]
+    assert imu.acc == pytest.approx(np.tile([0.0, 0.5, STANDARD_GRAVITY], (59, 1)))
+    assert imu.gyr[0] == pytest.approx([0.1, 0.2, 0.3])
+    assert imu.stamp[0] == 1_698_501_144_404_773_000    # beyond what a float tells apart
+    assert found["imu/mag"].mag[0] == pytest.approx([20e-6, 0.0, -40e-6])
+    fix, velocity = found["fix"], found["fix_velocity"]
+    assert list(fix.status) == [0, -1] and np.diag(fix.cov_enu[0]) == pytest.approx([4, 4, 9])
+    assert velocity.vel_world == pytest.approx(np.array([[4.0, 0.0, 0.0]]))
+    assert velocity.cov_world[0, 0, 0] == pytest.approx(0.25)
+    assert any("before the recording" in remark for remark in source.remarks)
+
+
+def test_without_the_platform_the_sign_is_not_guessed():
+    files = sensor_logger(without=("Metadata",))
+    with pytest.raises(SampleError, match="log: Metadata.csv does not tell the platform"):
+        read_parts(SensorLoggerExport(), files)
+    found = read_parts(SensorLoggerExport(platform="ios"), files)
+    assert found["imu/data_raw"].acc[0, 2] == pytest.approx(STANDARD_GRAVITY)
+
+
+def batches(size=7):
+    """What Sensor Logger pushes of the same session: standardised, of any order within it."""
+    files, payload = sensor_logger("android"), []
+    for name in ("Accelerometer", "Gravity", "Gyroscope", "Magnetometer"):
+        for line in files[f"log/{name}.csv"].decode().splitlines()[1:]:
+            stamp, since, z, y, x = line.split(",")
+            payload.append((float(since), {"name": name.lower(), "time": int(stamp), "values": {
+                "z": float(z), "y": float(y), "x": float(x)}}))
+    entries = [entry for _, entry in sorted(payload, key=lambda pair: pair[0])]
+    return [json.dumps({"messageId": k, "sessionId": "s", "deviceId": "d",
+                        "payload": entries[size * k:size * (k + 1)]}).encode()
+            for k in range(-(-len(entries) // size))]
+
+
+def test_pushed_out_of_order_is_what_is_exported():
+    source, pushed = SensorLoggerPush(), batches()
+    order = [0, 2, 1, 3, 6, 5, 4, *range(7, len(pushed))]
+    found = together([block for k in order for block in source.feed(pushed[k])] + source.finish())
+    expected = read_parts(SensorLoggerExport(), sensor_logger("android", without=("Location",)))
+    assert same(found, expected) and not source.lost
+
+
+def test_a_batch_that_never_comes_is_counted_and_the_rest_goes_on():
+    source, pushed = SensorLoggerPush(), batches()
+    for k, batch in enumerate(pushed):
+        if k != 4:
+            source.feed(batch)
+    source.feed(pushed[4])
+    assert source.lost["batches that did not come"] == 1
+    assert source.lost["batches that came twice, or after those that had waited for them"] == 1
+
+
+def zipped(files):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for part, data in files.items():
+            archive.writestr(part, data)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("name, files, taken", [
+    ("walk.zip", {"walk.zip": zipped(export())}, "phyphox"),
+    ("log.zip", {"log.zip": zipped(sensor_logger())}, "Sensor Logger"),
+    ("log", sensor_logger(), "Sensor Logger"), ("walk", export(), "phyphox"),
+    ("a.bin", {"a.bin": solution(1) + solution(2) + solution(3)}, "u-blox"),
+    ("a.log", {"a.log": b"".join(b"I,%d,0,0,0,0,0,1\r\n" % k for k in range(9))}, "x-IMU3")])
+def test_formats_are_recognised_by_content(tmp_path, name, files, taken):
+    for part, data in files.items():
+        (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / part).write_bytes(data)
+    with open_bag(tmp_path / name) as reader:
+        assert taken in reader.format and reader.count == sum(1 for _ in reader.messages())
+        logs = {topic: read_log(reader, topic) for topic in reader.topics}
+    assert all((np.diff(log.stamp) >= 0).all() for log in logs.values())
+
+
+def test_an_archive_that_unpacks_without_end_is_refused(tmp_path):
+    (tmp_path / "bomb.zip").write_bytes(zipped({
+        "Accelerometer.csv": b'"Time (s)","X (m/s^2)"\n' + b"0" * (1 << 26)}))
+    with pytest.raises(ImuFusionError, match="unpacks to more than"):
+        open_bag(tmp_path / "bomb.zip")
+    (tmp_path / "cut.zip").write_bytes(zipped(export())[:300] + b"PK\5\6" + bytes(18))
+    with pytest.raises(ImuFusionError, match=r"cut\.zip"):
+        open_bag(tmp_path / "cut.zip")
