@@ -81,7 +81,7 @@ COMPUTING_OF_FILES = {
         "source": {"re"}, "table": {"csv", "decimal", "re"}, "header": {"re"}, "sketch": {"re"},
         "registry": {"pathlib", "re"}, "avanode": {"re"},
         "sensor_logger": {"csv", "json", "pathlib"}, "ximu3": {"struct"}, "ulog": {"io", "pyulog"},
-        "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib"},
+        "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib", "zipfile"},
         "gnss": {"pynmeagps", "pyubx2", "re"}, "gpx": {"xml"}}.items()},
     "kernels.py": {"hashlib", "os", "pathlib", "pickle", "re", "shutil", "sys", "tempfile", "time"},
 }
