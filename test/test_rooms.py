@@ -61,6 +61,8 @@ ARROWS = {
 ARROWS_OF_FILES = {
     # A table of accelerometers is judged by the estimator that shall read it.
     "recordings/array_parameters.py": ("estimation.acceleration_field", "streams"),
+    # People read roll, pitch and yaw.
+    "recordings/export.py": ("geometry",),
 }
 
 # Below `messages`, and in the formats of devices, numbers are computed: no ROS, no files, no plots,
