@@ -354,6 +354,36 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
         sys.exit(INCOMPLETE)
 
 
+@cli.group()
+def calibrate() -> None:
+    """Calibrate a sensor from a recording, as a parameter file."""
+
+
+@calibrate.command("magnetometer")
+@click.argument("bag", type=click.Path())
+@click.option("--topic", default="imu/mag", show_default=True, help="Its topic in BAG.")
+@click.option("--out", type=click.Path(), help="Parameter file to write.")
+def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
+    """Hard and soft iron from BAG, in which the sensor turned about all axes.
+
+    Prints how well it is determined, and sensor.mag_offset and sensor.mag_matrix as the
+    orientation estimator and the smoother take them.
+    """
+    from imu_fusion import calibrate as calibration
+    found, remarks = calibration.calibrate_recorded_magnetometer(bag, topic)
+    table = Table("magnetometer", "")
+    for name, value in calibration.magnetometer_report(found):
+        table.add_row(name, value)
+    console.print(table)
+    for remark in remarks:
+        click.echo(f"warning: {remark}", err=True)
+    text = calibration.magnetometer_parameters(found, bag)
+    if out is None:
+        click.echo(text)
+    else:
+        Path(out).write_text(text)
+
+
 @cli.command(cls=_ListingCommand, listing=("Demos", DEMOS))
 @click.argument("name", default="orientation")
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,
@@ -395,6 +425,28 @@ def translate(file: str, out: str | None) -> None:
         click.echo(f"written: {out}", err=True)
     if result.unknown:
         sys.exit(1)
+
+
+@cli.command()
+@click.argument("table", type=click.Path())
+@click.option("--measuring-error", type=click.FloatRange(min=0.0), default=0.0, metavar="M",
+              help="Most that a measured length may be off, for the bound of the RMS.")
+def lengths(table: str, measuring_error: float) -> None:
+    """Compare smoothed jumps with measured lengths.
+
+    TABLE is a CSV file with the columns recording (an OUT of process or pipeline, relative to
+    TABLE) and measured (m).
+    """
+    from imu_fusion.evaluation.jump_length import JumpLengths
+    from imu_fusion.recordings.jump_table import read_lengths
+    jumps = JumpLengths(*read_lengths(table))
+    shown = Table("recording", "estimated m", "σ m", "measured m", "error m")
+    for row in zip(jumps.names, jumps.estimated, jumps.sd, jumps.measured, jumps.error):
+        shown.add_row(row[0], *(f"{value:.2f}" for value in row[1:4]), f"{row[4]:+.2f}")
+    console.print(shown)
+    click.echo(f"{len(jumps.names)} jumps: RMS {jumps.rms():.2f} m"
+               + (f", at most {jumps.rms(measuring_error):.2f} m where measured lengths are off by "
+                  f"up to {measuring_error:g} m" if measuring_error else ""))
 
 
 @cli.command()

@@ -7,13 +7,15 @@ end in :func:`smooth`, and so in the same messages.
 import json
 import math
 from collections.abc import Callable, Container, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError, MessageError, ParameterError
+from imu_fusion.estimation.orientation.params import OrientationParams
+from imu_fusion.estimation.orientation.recovered import recover
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.estimation.smoother.result import SmootherResult
@@ -92,6 +94,10 @@ class SmoothingParams(SmootherParams):
     OLD_NAMES: ClassVar[Mapping[str, str]] = {**SmootherParams.OLD_NAMES,
                                               "surface": "surface.file"}
 
+    recover_rates: bool = param(
+        False, doc="First recover rates beyond the gyroscope's range from the magnetometer, as the "
+        "orientation estimator does on a whole recording, and take them with their covariance. "
+        "Set it for a body that tumbles beyond the range.")
     surface: SurfaceFile = SurfaceFile()
     frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
@@ -248,8 +254,20 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoother(params, surface).run(logs[IMU_TOPIC], logs.get(MAG_TOPIC),
-                                         logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
+    imu, mag = logs[IMU_TOPIC], logs.get(MAG_TOPIC)
+    if params.recover_rates:
+        imu = recover(imu, mag, recovery_params(params))
+        params = params.replace(**{"sensor.gyro_range": None})
+    return Smoother(params, surface).run(imu, mag, logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
+
+
+def recovery_params(params: SmootherParams) -> OrientationParams:
+    """Parameters of the orientation estimator that recovers rates for the smoother: its sensor, and
+    a body in free fall and under blows, whose force says nothing of gravity."""
+    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_range", "mag_offset", "mag_matrix")
+    return OrientationParams().replace(**{
+        "fusion.use_acc": False,
+        **{f"sensor.{name}": getattr(params.sensor, name) for name in shared}})
 
 
 @dataclass(frozen=True)
@@ -268,7 +286,13 @@ class Outcome:
         numbers: dict[str, Any] = {
             "samples": len(result.samples), "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
-            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag}
+            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
+            "adapted": result.adapted, "noise": result.noise,
+            "outliers": {name: asdict(found) for name, found in result.outliers().items()}}
+        if result.gnss_step is not None:
+            numbers["gnss_step"] = {"stamp": result.gnss_step.stamp,
+                                    "offset": result.gnss_step.offset.tolist(),
+                                    "sd": result.gnss_step.sd.tolist()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()
