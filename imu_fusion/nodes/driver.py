@@ -6,7 +6,7 @@ from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from imu_fusion.errors import ParameterError, SampleError
+from imu_fusion.errors import DeviceError, ParameterError, SampleError
 from imu_fusion.nodes.base import IDLE, Node
 from imu_fusion.nodes.device_file import DeviceFile, Lot
 from imu_fusion.nodes.device_topics import DeviceTopic, DriverSensor
@@ -139,6 +139,8 @@ class Driver(Node):
         self._publish(Lot(self._source.finish(), time.time_ns()))
         self._publish_held()
         self.finished = True
+        if problem and not self._connections:
+            raise DeviceError(problem)
         if problem:
             self.problems.append(problem)
 
@@ -146,9 +148,10 @@ class Driver(Node):
         """Say what has changed about the device."""
         if connection.problem != self._problem:
             self._problem = connection.problem
-            if self._problem:
-                again = "; waiting for it" if self._p.reconnect else ""
-                self.get_logger().warning(self._problem + again)
+            if self._problem and self._p.reconnect:
+                self.get_logger().warning(f"{self._problem}; waiting for it")
+            elif self._problem and connection.connections:
+                self.get_logger().warning(self._problem)
         if connection.connections != self._connections:
             self._connections = connection.connections
             self.get_logger().info(f"{self._p.transport}: connected")
