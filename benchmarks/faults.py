@@ -293,7 +293,7 @@ def hostile(kind: str, trial: Trial) -> None:
 
 def hostile_session(kind: str, trial: Trial) -> None:
     """The same beside a replay."""
-    trial.play()
+    trial.play(rate=0.4)
     with trial.beside("-m", "benchmarks.hostile_peers", kind):
         trial.end("replayer", "recorder")
     trial.end("orientation_estimator", number=signal.SIGINT)
