@@ -78,7 +78,7 @@ COMPUTING_OF_FILES = {
     "surfaces/elevation_grid.py": {"pyproj", "rasterio"},    # a terrain is a file
     # Formats take bytes that others have read, and some know a library for what is in them.
     **{f"sources/{name}.py": extra for name, extra in {
-        "source": {"re"}, "table": {"csv", "decimal", "re"}, "header": {"re"},
+        "source": {"re"}, "table": {"csv", "decimal", "re"}, "header": {"re"}, "sketch": {"re"},
         "registry": {"pathlib", "re"}, "avanode": {"re"},
         "sensor_logger": {"csv", "json", "pathlib"}, "ximu3": {"struct"}, "ulog": {"io", "pyulog"},
         "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib"},

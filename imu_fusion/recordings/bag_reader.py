@@ -15,7 +15,8 @@ from typing import Any
 
 import zstandard
 
-from imu_fusion.errors import BagError, ImuFusionError, ParameterError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, MessageError, ParameterError, TopicError
+from imu_fusion.messages.nested import Nested, nested
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.recordings.mcap_storage import McapStorage
@@ -149,6 +150,7 @@ class Reader:
         self.warnings: list[str] = []
         self.damaged = False    # messages are lost
         self.format = ""
+        self._nested: dict[str, tuple[str, Nested]] = {}    # topic.field: (topic, what is there)
         self._storages: list[Storage] = []
         self._stored: dict[str, StoredTopic] = {}
         self._temporary: list[Any] = []
@@ -228,6 +230,9 @@ class Reader:
                 out: see ``warnings``.
         """
         wanted = {name for name in self.topics if topics is None or name in topics}
+        fields = {name: self._nested[name] for name in wanted if name in self._nested}
+        asked = wanted - fields.keys()
+        wanted = asked | {topic for topic, _ in fields.values()}
         parts = [Part(storage.times[0] if storage.times else 0, 0,
                       partial(storage.messages, wanted, start, stop))
                  for storage in self._storages]
@@ -239,7 +244,15 @@ class Reader:
                     if unpacked is None:
                         continue
                     data = unpacked
-                yield topic, self.topics[topic].msgtype, log_time, data
+                if topic in asked:
+                    yield topic, self.topics[topic].msgtype, log_time, data
+                for name, (holder, field) in fields.items():
+                    if holder == topic:
+                        try:
+                            yield name, field.msgtype, log_time, field.extract(data)
+                        except MessageError as error:
+                            self.lose(f"{name}: messages cannot be decoded and are left out "
+                                      f"({error})")
         except ImuFusionError:
             raise
         except Exception as error:
@@ -253,7 +266,7 @@ class Reader:
 
     def require(self, name: str, msgtype: str | None = None) -> TopicInfo:
         """The TopicInfo of ``name`` (with or without leading slash), or a TopicError."""
-        key = find_topic(self.topics, name)
+        key = self.find(name)
         if key is None:
             listing = ", ".join(f"{t.name} ({t.msgtype})" for t in self.topics.values()) or "none"
             raise TopicError(f"{self.path}: no topic '{name}'; it has: {listing}")
@@ -261,6 +274,30 @@ class Reader:
         if msgtype and info.msgtype != msgtype:
             raise TopicError(f"{self.path}: topic '{name}' is {info.msgtype}, expected {msgtype}")
         return info
+
+    def find(self, name: str) -> str | None:
+        """The topic that ``name`` is up to a leading slash, or None. ``topic.field`` is a message
+        inside of those of a topic, such as a sensor_msgs/Imu in the message of a driver."""
+        found = find_topic(self.topics, name)
+        if found is not None:
+            return found
+        holder, field = name, ""
+        while "." in holder:
+            holder, _, last = holder.rpartition(".")
+            field = f"{last}.{field}".rstrip(".")
+            topic = find_topic(self.topics, holder)
+            definition = None if topic is None else self.definition(topic)
+            if topic is None or definition is None:
+                continue
+            inside = nested(self.topics[topic].msgtype, definition[0], field)
+            if inside is not None:
+                full = f"{topic}.{field}"
+                self._nested[full] = topic, inside
+                self._stored[full] = StoredTopic(full, inside.msgtype)
+                self.topics[full] = TopicInfo(full, inside.msgtype, self.topics[topic].count,
+                                              self.topics[topic].qos_profiles)
+                return full
+        return None
 
     def definition(self, topic: str) -> tuple[str, str] | None:
         """(ros2msg definition with its dependencies, RIHS01 hash) of the type of a topic, as the

@@ -56,11 +56,13 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
     refuse_source(source, out)
     if description is not None:
         refuse_source(description, out)
-        refuse_files([source, description], parameter_file)
     with open_bag(source, description) as reader:
         text = "" if description is None else _array(reader, description)
-        if text and parameter_file.exists() and not overwrite:
-            raise BagError(f"{parameter_file}: exists already; choose another name or --overwrite")
+        if text:
+            refuse_files([source, description], parameter_file)
+            if parameter_file.exists() and not overwrite:
+                raise BagError(f"{parameter_file}: exists already; choose another name or "
+                               "--overwrite")
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
         renamed = {reader.require(other).name: name for name, other in (remap or {}).items()}
         with BagWriter(out, overwrite=overwrite, whole=True) as writer:

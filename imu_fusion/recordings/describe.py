@@ -6,7 +6,7 @@ from pathlib import Path
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.source_storage import format_of
 from imu_fusion.recordings.targets import refuse_files
-from imu_fusion.sources.header import sketch
+from imu_fusion.sources.sketch import sketch
 from imu_fusion.sources.transports.files import parts
 
 _HEAD = 1 << 20    # bytes that are looked at

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from imu_fusion.recordings.bag_reader import Reader, find_topic
+from imu_fusion.recordings.bag_reader import Reader
 
 
 def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[str, str],
@@ -23,7 +23,7 @@ def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[s
     """
     names = {}
     for topic, msgtype in {**required, **optional}.items():
-        name = find_topic(reader.topics, remap.get(topic, topic))
+        name = reader.find(remap.get(topic, topic))
         if name is not None and reader.topics[name].count:
             names[topic] = reader.require(name, msgtype).name
     missing = {topic: msgtype for topic, msgtype in required.items() if topic not in names}

@@ -1,25 +1,9 @@
-"""What a table says of itself: a first description from its names, units and values.
-
-Names and units that stand in the header are taken as they are; what they leave open is guessed from
-the values (gravity and the Earth's field are always there), and each guess is marked. A table that
-leaves nothing open needs no description.
-"""
+"""What the names of a table's columns say: sensor, axis, unit."""
 
 import re
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-import numpy as np
-
-from imu_fusion.errors import SampleError
 from imu_fusion.sources import units
-from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
-
-_LINES = 3000           # that are looked at
-_FIELD = (15e-6, 80e-6)  # T, of the Earth, with room
-_GRAVITY = (0.85, 1.15)  # of standard gravity, of a sensor at rest
-_SINCE_START = 1e8      # s, three years: times below do not count from 1970
-_COUNTS = 50.0          # of whole numbers with a greater norm: counts of a converter
 
 # What a column measures: pattern of its name, in lower case and without its unit.
 _SENSORS = {
@@ -27,7 +11,7 @@ _SENSORS = {
     "accelerometer": r"acc|force|^a[_ ]?[xyz]$|^f[xyz]$",
     "gyroscope": r"gyr|angular|rot|omega|^g[_ ]?[xyz]$|^w[_ ]?[xyz]$|rate",
     "magnetometer": r"mag|^m[_ ]?[xyz]$|^b[xyz]$"}
-_ONES = {
+ONES = {
     "lat": r"lat(itude)?", "lon": r"lon(g|gitude)?|lng",
     "height": r"height|h(_?ell)?|alt(itude)?([ _]?ellipsoid(al)?)?|ele(vation)?",
     "north": r"vel[ _]?n(orth)?|vn|v_n", "east": r"vel[ _]?e(ast)?|ve|v_e",
@@ -37,8 +21,11 @@ _ONES = {
     "s_acc": r"s[ _]?acc|speed[ _]?accuracy", "fix": r"fix[ _]?type",
     "qx": r"q(uat(ernion)?)?[ _.]?x", "qy": r"q(uat(ernion)?)?[ _.]?y",
     "qz": r"q(uat(ernion)?)?[ _.]?z", "qw": r"q(uat(ernion)?)?[ _.]?w"}
-_TIME = r"(packet|sample|system|sensor|micro\w*|unix|utc|gps)?[ _]?(time|timestamp|stamp|t)" \
+TIME = r"(packet|sample|system|sensor|micro\w*|unix|utc|gps)?[ _]?(time|timestamp|stamp|t)" \
         r"([ _]?(stamp|s|ms|us|ns|sec|fine))?|t|i?tow|date.*|seconds.elapsed"
+# Units that only one sensor has.
+_BY_UNIT = {"gyroscope": units.RATE, "accelerometer": units.ACCELERATION,
+            "magnetometer": {"uT": 1.0, "nT": 1.0, "mT": 1.0}}
 _UNIT_AT_END = re.compile(r"(.*?)[ _]*(?:[(\[]([^()\[\]]*)[)\]])?\s*$")
 _AXIS = re.compile(r"(.*?)(?:^|[ _.\-\[])([xyz])(?![a-z])[\])]?(.*)$|(.*[a-z0-9])([xyz])$")
 # Units that follow the name behind an underscore.
@@ -48,7 +35,7 @@ _SUFFIXES = {"ut": "uT", "mps": "m/s", "mps2": "m/s^2", "rads": "rad/s", "degs":
 
 @dataclass
 class Column:
-    """What the name of a column says: ``kind`` (of a sensor or of _ONES, '' for nothing known),
+    """What the name of a column says: ``kind`` (of a sensor or of ONES, '' for nothing known),
     ``axis`` 0 to 2, ``unit`` as written, ``group`` what tells several sensors of a kind apart."""
 
     name: str
@@ -66,7 +53,7 @@ def column_of(name: str) -> Column:
     suffix = _SUFFIX.match(low)
     if suffix and not unit:
         low, unit = suffix[1], _SUFFIXES.get(suffix[2], suffix[2])
-    for kind, pattern in _ONES.items():
+    for kind, pattern in ONES.items():
         if re.fullmatch(pattern, low):
             return Column(name, kind, unit=unit)
     axis = _AXIS.match(low)
@@ -75,341 +62,6 @@ def column_of(name: str) -> Column:
     letter = axis[2] or axis[5]
     around = (axis[4] or axis[1] + axis[3]).strip(" _.-")
     kind = next((k for k, p in _SENSORS.items() if re.search(p, low)), "")
-    if not kind and around.isdecimal() and units.spelled(unit, units.ACCELERATION):
-        kind = "accelerometer"    # 1X[g]: the first of several
+    if not kind:    # as in "a_RS_S_x [m s^-2]", or "1X[g]" of the first of several
+        kind = next((k for k, known in _BY_UNIT.items() if units.spelled(unit, known)), "")
     return Column(name, kind, "xyz".index(letter), unit, around)
-
-
-@dataclass
-class Sketch:
-    """A first description: ``content`` as in the YAML, ``remarks`` on its keys, ``doubts`` of
-    which some key was guessed, ``unused`` columns."""
-
-    content: dict[str, Any] = field(default_factory=dict)
-    remarks: dict[str, str] = field(default_factory=dict)
-    doubts: dict[str, str] = field(default_factory=dict)
-    unused: list[str] = field(default_factory=list)
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether nothing had to be guessed."""
-        return not self.doubts and any(k not in ("time",) and isinstance(v, dict)
-                                       for k, v in self.content.items())
-
-    def to_yaml(self) -> str:
-        """The text of the description, each guess marked."""
-        lines = ["# Read from the header and the values. Lines that end in 'guess' are to be "
-                 "checked."]
-        for key, value in self.content.items():
-            if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
-                lines.append(f"{key}:")
-                lines += [f"  {name}: {_flow(v)}{self._mark(f'{key}.{name}')}"
-                          for name, v in value.items()]
-            else:
-                lines.append(f"{key}: {_flow(value)}{self._mark(key)}")
-        if self.unused:
-            lines.append(f"# not used: {', '.join(self.unused)}")
-        return "\n".join(lines) + "\n"
-
-    def _mark(self, key: str) -> str:
-        if key in self.doubts:
-            return f"    # {self.doubts[key]}: guess"
-        return f"    # {self.remarks[key]}" if key in self.remarks else ""
-
-
-def _flow(value: Any) -> str:
-    """YAML on one line; strings in quotes where they need them."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k}: {_flow(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_flow, value)) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        plain = re.fullmatch(r"[A-Za-z_][\w/^]*", value) and value.lower() not in (
-            "y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf")
-        return value if plain else '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return repr(value)
-
-
-def sketch(data: bytes, where: str) -> Sketch:
-    """A first description of a table from its beginning.
-
-    Raises:
-        SampleError: this is no table of numbers.
-    """
-    lines = [line.rstrip("\r") for line in
-             data.decode("utf-8-sig", "replace").split("\n")[:_LINES]]
-    if len(data) and not data.endswith(b"\n") and len(lines) > 2:
-        lines.pop()    # perhaps cut in the middle
-    best = max((_layout(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "space")
-                for decimal in ".," if delimiter != decimal), key=lambda layout: layout.score)
-    if best.score <= 0:
-        raise SampleError(f"{where}: no rows of numbers are found; a table has a line for each "
-                          "sample")
-    result = Sketch()
-    delimiter = {"\t": "tab"}.get(best.delimiter, best.delimiter)
-    for key, value, usual in (("delimiter", delimiter, ","), ("decimal", best.decimal, "."),
-                              ("skip_lines", best.skip, 0), ("header", best.header, True)):
-        if value != usual:
-            result.content[key] = value
-    values = {name: np.array([_value(row[k], best.decimal) for row in best.rows])
-              for k, name in enumerate(best.names)}
-    columns = [column_of(name) if best.header else Column(name) for name in best.names]
-    _sketch_time(result, columns, values, {name: best.rows[0][k]
-                                           for k, name in enumerate(best.names)})
-    if not best.header:
-        columns = _by_values(columns, values, result.content["time"].get("column"))
-    _sketch_vectors(result, columns, values)
-    _sketch_gnss(result, columns, values)
-    used = set(_used(result.content))
-    result.unused = [c.name for c in columns if c.name not in used]
-    return result
-
-
-@dataclass
-class _Layout:
-    score: float
-    delimiter: str = ","
-    decimal: str = "."
-    skip: int = 0
-    header: bool = True
-    names: list[str] = field(default_factory=list)
-    rows: list[list[str]] = field(default_factory=list)
-
-
-def _cut(line: str, delimiter: str) -> list[str]:
-    cells = line.split() if delimiter == "space" else line.split(delimiter)
-    return [cell.strip().strip('"').strip() for cell in cells]
-
-
-def _value(text: str, decimal: str) -> float:
-    text = text.replace(",", ".") if decimal == "," else text
-    return float(text) if is_number(text) else np.nan
-
-
-def _layout(lines: list[str], delimiter: str, decimal: str) -> _Layout:
-    """How the lines look when cut so: its score is the number of numeric cells of like rows."""
-    rows = [(k, _cut(line, delimiter)) for k, line in enumerate(lines) if line.strip()]
-    numeric = {k: sum(np.isfinite(_value(c, decimal)) for c in cells) for k, cells in rows}
-    like = [(k, cells) for k, cells in rows if len(cells) > 1 and numeric[k] >= 0.5 * len(cells)]
-    if len(like) < 3:
-        return _Layout(0.0)
-    width = int(np.median([len(cells) for _, cells in like]))
-    body = [(k, cells) for k, cells in like if len(cells) == width]
-    first = body[0][0]
-    above = [(k, cells) for k, cells in rows if k < first]
-    header = bool(above) and len(above[-1][1]) == width
-    names = above[-1][1] if header else [str(i + 1) for i in range(width)]
-    skip = above[-1][0] if header else (above[-1][0] + 1 if above else 0)
-    score = float(sum(numeric[k] for k, _ in body)) / len(rows)
-    if 2 * len(body) < len(rows) - (len(above) if header else 0):
-        return _Layout(0.0)
-    return _Layout(score, delimiter, decimal, skip, header, names, [cells for _, cells in body])
-
-
-def _sketch_time(result, columns, values, first):
-    """The time column: by name, else the first that rises throughout."""
-    rising = [c for c in columns if len(values[c.name]) > 1
-              and (np.diff(values[c.name]) >= 0).all() and np.ptp(values[c.name]) > 0]
-    named_so = [c for c in columns if not c.kind and re.fullmatch(
-        _TIME, c.name.split("[")[0].split("(")[0].strip(' "#').lower())]
-    calendar = [c for c in columns if re.match(r"\d{4}[-/]\d\d[-/]\d\d[T ]\d", first[c.name])]
-    if calendar:
-        result.content["time"] = {"column": calendar[0].name, "unit": "iso8601"}
-        return
-    chosen = ([c for c in named_so if c in rising] or named_so or rising or [None])[0]
-    if chosen is None:
-        result.content["time"] = {"rate": 100.0}
-        result.doubts["time"] = "no column of times is found, the rate is not known"
-        return
-    step = float(np.nanmedian(np.abs(np.diff(values[chosen.name]))))
-    start = float(np.nanmax(values[chosen.name]))
-    unit = units.spelled(chosen.unit, units.TIME)
-    suffix = re.search(r"[ _](s|ms|us|ns|sec)$|(nano|micro|milli)", chosen.name.lower())
-    known = unit or (suffix and {"nano": "ns", "micro": "us", "milli": "ms", "sec": "s"}.get(
-        suffix[1] or suffix[2], suffix[1]))
-    guessed = known or _time_unit(step, start)
-    result.content["time"] = {"column": chosen.name, "unit": guessed}
-    if start * 10.0 ** (units.TIME[guessed] - 9) < _SINCE_START:
-        result.content["time"]["start"] = EPOCH * 1e-9    # counted from some start
-    if not known or chosen not in named_so:
-        result.doubts["time"] = (f"steps of {step:g} would be "
-                                 f"{1 / (step * 10.0 ** (units.TIME[guessed] - 9)):.4g} Hz"
-                                 if step else "the times stand still")
-    elif step:
-        rate = 1 / (step * 10.0 ** (units.TIME[guessed] - 9))
-        result.remarks["time"] = f"{rate:.4g} Hz"
-        if not 0.05 <= rate <= 100e3:
-            result.doubts["time"] = f"{rate:.4g} Hz, is the unit right?"
-
-
-def _time_unit(step, latest):
-    """The unit in which stamps are of our years, or else steps of usual rates."""
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
-        if latest > least:
-            return unit
-    if latest > 1e8 and step < 100:
-        return "s"
-    return "s" if step < 0.7 else "ms" if step < 300 else "us" if step < 3e5 else "ns"
-
-
-def _by_values(columns, values, time):
-    """Without names: triples in a row, of which one shows gravity; the other two are taken for the
-    gyroscope and the magnetometer in the usual order."""
-    rest = [c for c in columns if c.name != time][:9]
-    triples = [rest[k:k + 3] for k in range(0, len(rest) - 2, 3)]
-    if not triples:
-        return columns
-
-    def like_gravity(triple):
-        data = np.column_stack([values[c.name] for c in triple])
-        norm = _quiet(data)
-        fits = any(_GRAVITY[0] < norm * f / STANDARD_GRAVITY < _GRAVITY[1]
-                   for f in units.ACCELERATION.values())
-        return fits, bool((data == np.round(data)).all()) * norm
-
-    force = max(triples[:2], key=like_gravity)
-    kinds = ("accelerometer", "gyroscope", "magnetometer")
-    order = [force, *(t for t in triples if t is not force)]
-    known = {c.name: Column(c.name, kind, axis) for kind, triple in zip(kinds, order)
-             for axis, c in enumerate(triple)}
-    return [known.get(c.name, c) for c in columns]
-
-
-def _groups(columns, kind):
-    """{group: columns of x, y, z} of the sensors of a kind of which all axes are there."""
-    groups: dict[str, dict[int, Column]] = {}
-    for c in columns:
-        if c.kind == kind and c.axis is not None:
-            groups.setdefault(c.group, {}).setdefault(c.axis, c)
-    return {group: [axes[k] for k in range(3)] for group, axes in groups.items() if len(axes) == 3}
-
-
-def _sketch_vectors(result, columns, values):
-    for kind, known in (("accelerometer", units.ACCELERATION), ("gyroscope", units.RATE),
-                        ("magnetometer", units.FIELD)):
-        groups = _groups(columns, kind)
-        if kind == "accelerometer" and len(groups) > 1 and all(
-                re.search(r"\d", group) for group in groups):
-            _sketch_array(result, groups)
-            continue
-        if not groups:
-            continue
-        group, axes = next(iter(groups.items()))
-        if len(groups) > 1:
-            result.doubts[kind] = f"one of {len(groups)}"
-        data = np.column_stack([values[c.name] for c in axes])
-        unit, scale, doubt = _unit_of(kind, axes[0].unit, known, data)
-        result.content[kind] = {"columns": [c.name for c in axes], "unit": unit}
-        if scale != 1.0:
-            result.content[kind]["scale"] = scale
-        if doubt:
-            result.doubts[kind] = doubt
-        elif kind == "accelerometer":
-            _remark_gravity(result, data * known[unit] / scale)
-
-
-def _sketch_array(result, groups):
-    array = {}
-    for group, axes in groups.items():
-        name = "a" + re.sub(r"\W", "", group)
-        array[name] = {"columns": [c.name for c in axes],
-                       "unit": units.spelled(axes[0].unit, units.ACCELERATION) or "m/s^2",
-                       "position": [0.0, 0.0, 0.0]}
-        result.doubts[f"accelerometers.{name}"] = "where it sits, and its axes"
-    result.content["accelerometers"] = array
-
-
-def _quiet(data):
-    """Median of the norms where they change least: (norm, mean vector)."""
-    norms = np.linalg.norm(data, axis=1)
-    norms = norms[np.isfinite(norms)]
-    if len(norms) < 3:
-        return np.nan
-    size = max(min(50, len(norms) // 2), 2)
-    windows = np.lib.stride_tricks.sliding_window_view(norms, size)
-    return float(np.median(windows[int(np.argmin(np.ptp(windows, axis=1)))]))
-
-
-def _unit_of(kind, written, known, data):
-    """(unit, counts per unit, what is doubtful) of a sensor."""
-    unit = units.spelled(written, known)
-    rest = _quiet(data)
-    if kind == "gyroscope":
-        if unit:
-            return unit, 1.0, ""
-        peak = float(np.nanmax(np.abs(data)))
-        whole = bool((data == np.round(data)).all()) and peak > _COUNTS
-        return "deg/s", 16.4 if whole else 1.0, (
-            f"unit not named; greatest value {peak:g}" + (", counts?" if whole else ""))
-    if kind == "magnetometer":
-        if unit:
-            return unit, 1.0, ""
-        fits = [u for u, f in known.items() if _FIELD[0] < rest * f < _FIELD[1]]
-        return (fits or ["uT"])[0], 1.0, f"unit not named; norm {rest:g}"
-    if unit:
-        felt = rest * known[unit] / STANDARD_GRAVITY
-        wrong = np.isfinite(felt) and felt < 0.2
-        return unit, 1.0, f"{felt:.2g} g at rest: gravity is not in it" if wrong else ""
-    for unit, factor in known.items():
-        if _GRAVITY[0] < rest * factor / STANDARD_GRAVITY < _GRAVITY[1]:
-            return unit, 1.0, f"unit not named; norm at rest {rest:.4g}"
-    if bool((data == np.round(data)).all()) and rest > _COUNTS:
-        scale = float(2 ** round(np.log2(rest)))
-        return "g", scale, f"counts; {rest:g} at rest taken as about 1 g"
-    return "m/s^2", 1.0, f"unit not named; norm at rest {rest:.4g}"
-
-
-def _remark_gravity(result, acc):
-    mean = np.nanmedian(acc, axis=0)
-    result.remarks["accelerometer"] = (
-        "median (" + ", ".join(f"{v:.1f}" for v in mean)
-        + ") m/s^2: at rest +9.8 on the axis that points up, else turn it with rotation")
-
-
-def _sketch_gnss(result, columns, values):
-    have = {c.kind: c for c in columns if c.kind in _ONES}
-
-    def unit(kind, known, usual, key):
-        found = units.spelled(have[kind].unit, known)
-        if found is None:
-            result.doubts[key] = f"unit of {have[kind].name} not named"
-        return found or usual
-
-    if {"lat", "lon", "height"} <= have.keys():
-        angle = units.spelled(have["lat"].unit, units.ANGLE)
-        peak = float(np.nanmax(np.abs(values[have["lon"].name])))
-        entry: dict[str, Any] = {
-            "columns": [have[k].name for k in ("lat", "lon", "height")],
-            "unit": angle or ("deg" if peak <= 360 else "1e-7 deg"),
-            "height_unit": unit("height", units.LENGTH, "m", "position")}
-        accuracy = [have[k].name for k in ("h_acc", "v_acc") if k in have]
-        if len(accuracy) == 2:
-            entry["accuracy"] = accuracy
-        if "fix" in have:
-            entry["fix"] = have["fix"].name
-        result.content["position"] = entry
-    frames = ((("north", "east", "down"), "ned"), (("east", "north", "up"), "enu"),
-              (("speed", "course"), "course"))
-    for kinds, frame in frames:
-        if set(kinds) <= have.keys():
-            result.content["velocity"] = {
-                "columns": [have[k].name for k in kinds], "frame": frame,
-                "unit": unit(kinds[0], units.SPEED, "m/s", "velocity")}
-            if "s_acc" in have:
-                result.content["velocity"]["accuracy"] = [have["s_acc"].name]
-            break
-    if {"qx", "qy", "qz", "qw"} <= have.keys():
-        result.content["reference"] = {"columns": [have[k].name for k in ("qx", "qy", "qz", "qw")]}
-        result.doubts["reference"] = "taken as world (east, north, up) <- imu"
-
-
-def _used(content):
-    for value in content.values():
-        if isinstance(value, dict):
-            yield from _used(value)
-        elif isinstance(value, list):
-            yield from (v for v in value if isinstance(v, str))
-        elif isinstance(value, str):
-            yield value

@@ -367,6 +367,8 @@ def _fixes(where: str, sensor: Any, stamp: np.ndarray, columns: Mapping[str, np.
     status = np.full(len(stamp), float(FIXED))
     if sensor.fix is not None:
         status[~(columns[sensor.fix] >= sensor.fix_at_least)] = NO_FIX
+    for name in sensor.accuracy:    # as phones say that it is not valid
+        status[columns[name] < 0] = NO_FIX
     log = FixLog(stamp, lat, lon, height,
                  variances(columns, sensor.accuracy, units.LENGTH[sensor.height_unit]), status)
     return log[np.isfinite(np.column_stack([lat, lon, height])).all(axis=1)]

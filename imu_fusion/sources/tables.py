@@ -2,7 +2,7 @@
 
 from imu_fusion.errors import SampleError
 from imu_fusion.sources.description import Description
-from imu_fusion.sources.header import sketch
+from imu_fusion.sources.sketch import sketch
 from imu_fusion.sources.source import Block, Source, Whole
 from imu_fusion.sources.table import TableSource
 

@@ -11,10 +11,10 @@ from imu_fusion.errors import ImuFusionError
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.gnss import Receiver
 from imu_fusion.sources.gpx import Gpx
-from imu_fusion.sources.header import sketch
 from imu_fusion.sources.phyphox import PhyphoxLive
 from imu_fusion.sources.registry import FORMATS
 from imu_fusion.sources.sensor_logger import SensorLoggerPush
+from imu_fusion.sources.sketch import sketch
 from imu_fusion.sources.table import TableSource
 from imu_fusion.sources.ximu3 import Ximu3
 from test.sources.logs import read, same

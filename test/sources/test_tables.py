@@ -14,7 +14,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.convert import convert
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.sources.description import Description
-from imu_fusion.sources.header import sketch
+from imu_fusion.sources.sketch import sketch
 from imu_fusion.sources.table import TableSource
 from test.sources.logs import read
 
@@ -130,6 +130,42 @@ def test_what_is_guessed_is_marked_and_right(data, unit, scale):
     imu = read(source, data, "t.csv")["imu/data_raw"]
     assert imu.acc[:100].mean(axis=0) == pytest.approx([0, 0, G], abs=0.05)
     assert np.median(np.diff(imu.stamp)) == pytest.approx(10_000_000)
+
+
+@pytest.mark.parametrize("factor, whole, unit, scale", [
+    (1.0, False, "rad/s", 1.0), (np.degrees(1.0), False, "deg/s", 1.0),
+    (np.degrees(1.0) * 131.0, True, "deg/s", 131.0)])
+@pytest.mark.parametrize("vector", ["acc", "mag"])
+def test_the_unit_of_a_gyroscope_is_told_by_how_the_field_turns(factor, whole, unit, scale, vector):
+    rate = RATE * factor
+    names = ",".join(f"{vector}_{axis}" for axis in "xyz")
+    found = sketch(written(f"time,{names},gyr_x,gyr_y,gyr_z", T, FORCE if vector == "acc" else MAG,
+                           np.round(rate) if whole else rate), "t.csv")
+    assert found.content["gyroscope"]["unit"] == unit
+    assert found.content["gyroscope"].get("scale", 1.0) == pytest.approx(scale, rel=0.05)
+
+
+def test_headers_of_some_loggers():
+    xsens = sketch(b"// Update Rate: 100.0Hz\n// Firmware Version: 4.0.2\n" + written(
+        "\t".join(["PacketCounter", "SampleTimeFine", *(f"{s}_{a}" for s in ("Acc", "Gyr", "Mag")
+                                                       for a in "XYZ")]),
+        np.arange(len(T)), 5000 + 1e4 * T, FORCE, RATE, MAG / 48.0, delimiter="\t"), "xsens.txt")
+    assert xsens.content["time"]["tick"] == 1e-4 and xsens.content["skip_lines"] == 2
+    assert xsens.content["gyroscope"]["unit"] == "rad/s"
+    assert "fits no unit" in xsens.doubts["magnetometer"]
+    euroc = sketch(written(
+        "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+        "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]", 1.4e18 + 1e9 * T, RATE, FORCE),
+                   "e")
+    assert euroc.is_sure
+    # Apple's sign: gravity points where it pulls. Nothing in the values tells it from a sensor
+    # that lies on its face.
+    apple = sketch(written(
+        "time (s),accelerometerAccelerationX(G),accelerometerAccelerationY(G),"
+        "accelerometerAccelerationZ(G),motionUserAccelerationX(G),motionUserAccelerationY(G),"
+        "motionUserAccelerationZ(G)", T, -FORCE / G, 0 * FORCE), "a.csv")
+    assert "is the sign wrong" in apple.doubts["accelerometer"]
+    assert "motionUserAccelerationX(G)" in apple.unused
 
 
 def test_force_without_gravity_is_doubted():

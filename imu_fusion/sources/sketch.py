@@ -1,0 +1,438 @@
+"""What a table says of itself: a first description from its names, units and values.
+
+Names and units that stand in the header are taken as they are; what they leave open is guessed from
+the values (gravity and the Earth's field are always there), and each guess is marked. A table that
+leaves nothing open needs no description.
+"""
+
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from imu_fusion.errors import SampleError
+from imu_fusion.sources import units
+from imu_fusion.sources.header import ONES, TIME, Column, column_of
+from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
+
+_LINES = 3000           # that are looked at
+_FIELD = (15e-6, 80e-6)  # T, of the Earth, with room
+_GRAVITY = (0.85, 1.15)  # of standard gravity, of a sensor at rest
+_SINCE_START = 1e8      # s, three years: times below do not count from 1970
+_COUNTS = 50.0          # of whole numbers with a greater norm: counts of a converter
+
+_LEAST_TURN = 0.3       # rad, that tells in which unit a gyroscope is
+_WELL = 0.9             # share of what turned that a gyroscope explains
+# Times of some loggers, by the name of their column: unit, s per tick.
+_KNOWN_TIMES = {"sampletimefine": ("tick", 1e-4)}    # Xsens MT Manager
+
+
+@dataclass
+class Sketch:
+    """A first description: ``content`` as in the YAML, ``remarks`` on its keys, ``doubts`` of
+    which some key was guessed, ``unused`` columns."""
+
+    content: dict[str, Any] = field(default_factory=dict)
+    remarks: dict[str, str] = field(default_factory=dict)
+    doubts: dict[str, str] = field(default_factory=dict)
+    unused: list[str] = field(default_factory=list)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether nothing had to be guessed."""
+        return not self.doubts and any(k not in ("time",) and isinstance(v, dict)
+                                       for k, v in self.content.items())
+
+    def to_yaml(self) -> str:
+        """The text of the description, each guess marked."""
+        lines = ["# Read from the header and the values. Lines that end in 'guess' are to be "
+                 "checked."]
+        for key, value in self.content.items():
+            if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
+                lines.append(f"{key}:")
+                lines += [f"  {name}: {_flow(v)}{self._mark(f'{key}.{name}')}"
+                          for name, v in value.items()]
+            else:
+                lines.append(f"{key}: {_flow(value)}{self._mark(key)}")
+        if self.unused:
+            lines.append(f"# not used: {', '.join(self.unused)}")
+        return "\n".join(lines) + "\n"
+
+    def _mark(self, key: str) -> str:
+        if key in self.doubts:
+            return f"    # {self.doubts[key]}: guess"
+        return f"    # {self.remarks[key]}" if key in self.remarks else ""
+
+
+def _flow(value: Any) -> str:
+    """YAML on one line; strings in quotes where they need them."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k}: {_flow(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_flow, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        plain = re.fullmatch(r"[A-Za-z_][\w/^]*", value) and value.lower() not in (
+            "y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf")
+        return value if plain else '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return repr(value)
+
+
+def sketch(data: bytes, where: str) -> Sketch:
+    """A first description of a table from its beginning.
+
+    Raises:
+        SampleError: this is no table of numbers.
+    """
+    lines = [line.rstrip("\r") for line in
+             data.decode("utf-8-sig", "replace").split("\n")[:_LINES]]
+    if len(data) and not data.endswith(b"\n") and len(lines) > 2:
+        lines.pop()    # perhaps cut in the middle
+    best = max((_layout(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "space")
+                for decimal in ".," if delimiter != decimal), key=lambda layout: layout.score)
+    if best.score <= 0:
+        raise SampleError(f"{where}: no rows of numbers are found; a table has a line for each "
+                          "sample")
+    result = Sketch()
+    delimiter = {"\t": "tab"}.get(best.delimiter, best.delimiter)
+    for key, value, usual in (("delimiter", delimiter, ","), ("decimal", best.decimal, "."),
+                              ("skip_lines", best.skip, 0), ("header", best.header, True)):
+        if value != usual:
+            result.content[key] = value
+    values = {name: np.array([_value(row[k], best.decimal) for row in best.rows])
+              for k, name in enumerate(best.names)}
+    columns = [column_of(name) if best.header else Column(name) for name in best.names]
+    _sketch_time(result, columns, values, {name: best.rows[0][k]
+                                           for k, name in enumerate(best.names)})
+    if not best.header:
+        columns = _by_values(columns, values, result.content["time"].get("column"))
+    _sketch_vectors(result, columns, values)
+    _sketch_gnss(result, columns, values)
+    used = set(_used(result.content))
+    result.unused = [c.name for c in columns if c.name not in used]
+    return result
+
+
+@dataclass
+class _Layout:
+    score: float
+    delimiter: str = ","
+    decimal: str = "."
+    skip: int = 0
+    header: bool = True
+    names: list[str] = field(default_factory=list)
+    rows: list[list[str]] = field(default_factory=list)
+
+
+def _cut(line: str, delimiter: str) -> list[str]:
+    cells = line.split() if delimiter == "space" else line.split(delimiter)
+    return [cell.strip().strip('"').strip() for cell in cells]
+
+
+def _value(text: str, decimal: str) -> float:
+    text = text.replace(",", ".") if decimal == "," else text
+    return float(text) if is_number(text) else np.nan
+
+
+def _layout(lines: list[str], delimiter: str, decimal: str) -> _Layout:
+    """How the lines look when cut so: its score is the number of numeric cells of like rows."""
+    rows = [(k, _cut(line, delimiter)) for k, line in enumerate(lines) if line.strip()]
+    numeric = {k: sum(np.isfinite(_value(c, decimal)) for c in cells) for k, cells in rows}
+    like = [(k, cells) for k, cells in rows if len(cells) > 1 and numeric[k] >= 0.5 * len(cells)]
+    if len(like) < 3:
+        return _Layout(0.0)
+    width = int(np.median([len(cells) for _, cells in like]))
+    body = [(k, cells) for k, cells in like if len(cells) == width]
+    first = body[0][0]
+    above = [(k, cells) for k, cells in rows if k < first]
+    header = bool(above) and len(above[-1][1]) == width
+    names = above[-1][1] if header else [str(i + 1) for i in range(width)]
+    skip = above[-1][0] if header else (above[-1][0] + 1 if above else 0)
+    score = float(sum(numeric[k] for k, _ in body)) / len(rows)
+    if 2 * len(body) < len(rows) - (len(above) if header else 0):
+        return _Layout(0.0)
+    return _Layout(score, delimiter, decimal, skip, header, names, [cells for _, cells in body])
+
+
+def _sketch_time(result, columns, values, first):
+    """The time column: by name, else the first that rises throughout."""
+    rising = [c for c in columns if len(values[c.name]) > 1
+              and (np.diff(values[c.name]) >= 0).all() and np.ptp(values[c.name]) > 0]
+    named_so = [c for c in columns if not c.kind and re.fullmatch(
+        TIME, c.name.split("[")[0].split("(")[0].strip(' "#').lower())]
+    calendar = [c for c in columns if re.match(r"\d{4}[-/]\d\d[-/]\d\d[T ]\d", first[c.name])]
+    if calendar:
+        result.content["time"] = {"column": calendar[0].name, "unit": "iso8601"}
+        return
+    chosen = ([c for c in named_so if c in rising] or named_so or rising or [None])[0]
+    if chosen is None:
+        result.content["time"] = {"rate": 100.0}
+        result.doubts["time"] = "no column of times is found, the rate is not known"
+        return
+    step = float(np.nanmedian(np.abs(np.diff(values[chosen.name]))))
+    start = float(np.nanmax(values[chosen.name]))
+    unit = units.spelled(chosen.unit, units.TIME)
+    suffix = re.search(r"[ _](s|ms|us|ns|sec)$|(nano|micro|milli)", chosen.name.lower())
+    known = unit or (suffix and {"nano": "ns", "micro": "us", "milli": "ms", "sec": "s"}.get(
+        suffix[1] or suffix[2], suffix[1]))
+    logger = _KNOWN_TIMES.get(chosen.name.lower())
+    if logger:
+        result.content["time"] = {"column": chosen.name, "unit": logger[0], "tick": logger[1],
+                                  "wrap": 2.0 ** 32, "start": EPOCH * 1e-9}
+        result.remarks["time"] = f"{1 / (step * logger[1]):.4g} Hz" if step else ""
+        return
+    guessed = known or _time_unit(step, start)
+    result.content["time"] = {"column": chosen.name, "unit": guessed}
+    if start * 10.0 ** (units.TIME[guessed] - 9) < _SINCE_START:
+        result.content["time"]["start"] = EPOCH * 1e-9    # counted from some start
+    if not known or chosen not in named_so:
+        result.doubts["time"] = (f"steps of {step:g} would be "
+                                 f"{1 / (step * 10.0 ** (units.TIME[guessed] - 9)):.4g} Hz"
+                                 if step else "the times stand still")
+    elif step:
+        rate = 1 / (step * 10.0 ** (units.TIME[guessed] - 9))
+        result.remarks["time"] = f"{rate:.4g} Hz"
+        if not 0.05 <= rate <= 100e3:
+            result.doubts["time"] = f"{rate:.4g} Hz, is the unit right?"
+
+
+def _time_unit(step, latest):
+    """The unit in which stamps are of our years, or else steps of usual rates."""
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
+        if latest > least:
+            return unit
+    if latest > 1e8 and step < 100:
+        return "s"
+    return "s" if step < 0.7 else "ms" if step < 300 else "us" if step < 3e5 else "ns"
+
+
+def _by_values(columns, values, time):
+    """Without names: triples in a row, of which one shows gravity; the other two are taken for the
+    gyroscope and the magnetometer in the usual order."""
+    rest = [c for c in columns if c.name != time][:9]
+    triples = [rest[k:k + 3] for k in range(0, len(rest) - 2, 3)]
+    if not triples:
+        return columns
+
+    def like_gravity(triple):
+        data = np.column_stack([values[c.name] for c in triple])
+        norm = _quiet(data)
+        fits = any(_GRAVITY[0] < norm * f / STANDARD_GRAVITY < _GRAVITY[1]
+                   for f in units.ACCELERATION.values())
+        return fits, bool((data == np.round(data)).all()) * norm
+
+    force = max(triples[:2], key=like_gravity)
+    kinds = ("accelerometer", "gyroscope", "magnetometer")
+    order = [force, *(t for t in triples if t is not force)]
+    known = {c.name: Column(c.name, kind, axis) for kind, triple in zip(kinds, order)
+             for axis, c in enumerate(triple)}
+    return [known.get(c.name, c) for c in columns]
+
+
+def _groups(columns, kind):
+    """{group: columns of x, y, z} of the sensors of a kind of which all axes are there."""
+    groups: dict[str, dict[int, Column]] = {}
+    for c in columns:
+        if c.kind == kind and c.axis is not None:
+            groups.setdefault(c.group, {}).setdefault(c.axis, c)
+    return {group: [axes[k] for k in range(3)] for group, axes in groups.items() if len(axes) == 3}
+
+
+def _sketch_vectors(result, columns, values):
+    for kind, known in (("accelerometer", units.ACCELERATION), ("gyroscope", units.RATE),
+                        ("magnetometer", units.FIELD)):
+        groups = _groups(columns, kind)
+        if kind == "accelerometer" and len(groups) > 1 and all(
+                re.search(r"\d", group) for group in groups):
+            _sketch_array(result, groups)
+            continue
+        if not groups:
+            continue
+        group, axes = next(iter(groups.items()))
+        if len(groups) > 1:
+            result.doubts[kind] = f"one of {len(groups)}"
+        data = np.column_stack([values[c.name] for c in axes])
+        if kind == "gyroscope":
+            unit, scale, doubt = _rate_unit(axes[0].unit, data, _turned(columns, values),
+                                            _seconds(result, values))
+        else:
+            unit, scale, doubt = _unit_of(kind, axes[0].unit, known, data)
+        result.content[kind] = {"columns": [c.name for c in axes], "unit": unit}
+        if scale != 1.0:
+            result.content[kind]["scale"] = scale
+        if doubt:
+            result.doubts[kind] = doubt
+        elif kind == "accelerometer":
+            _remark_gravity(result, data * known[unit] / scale)
+
+
+def _sketch_array(result, groups):
+    array = {}
+    for group, axes in groups.items():
+        name = "a" + re.sub(r"\W", "", group)
+        array[name] = {"columns": [c.name for c in axes],
+                       "unit": units.spelled(axes[0].unit, units.ACCELERATION) or "m/s^2",
+                       "position": [0.0, 0.0, 0.0]}
+        result.doubts[f"accelerometers.{name}"] = "where it sits, and its axes"
+    result.content["accelerometers"] = array
+
+
+def _quiet(data):
+    """Median of the norms where they change least: (norm, mean vector)."""
+    norms = np.linalg.norm(data, axis=1)
+    norms = norms[np.isfinite(norms)]
+    if len(norms) < 3:
+        return np.nan
+    size = max(min(50, len(norms) // 2), 2)
+    windows = np.lib.stride_tricks.sliding_window_view(norms, size)
+    return float(np.median(windows[int(np.argmin(np.ptp(windows, axis=1)))]))
+
+
+def _unit_of(kind, written, known, data):
+    """(unit, counts per unit, what is doubtful) of a sensor."""
+    unit = units.spelled(written, known)
+    rest = _quiet(data)
+    if kind == "magnetometer":
+        if unit:
+            return unit, 1.0, ""
+        fits = [u for u, f in known.items() if _FIELD[0] < rest * f < _FIELD[1]]
+        if fits:
+            return fits[0], 1.0, f"unit not named; norm {rest:.4g}"
+        return "uT", rest / 50.0 if rest > 0 else 1.0, (
+            f"norm {rest:.4g} fits no unit: taken as 50 uT")
+    if unit:
+        felt = rest * known[unit] / STANDARD_GRAVITY
+        wrong = np.isfinite(felt) and felt < 0.2
+        return unit, 1.0, f"{felt:.2g} g at rest: gravity is not in it" if wrong else ""
+    for unit, factor in known.items():
+        if _GRAVITY[0] < rest * factor / STANDARD_GRAVITY < _GRAVITY[1]:
+            return unit, 1.0, f"unit not named; norm at rest {rest:.4g}"
+    if bool((data == np.round(data)).all()) and rest > _COUNTS:
+        scale = float(2 ** round(np.log2(rest)))
+        return "g", scale, f"counts; {rest:g} at rest taken as about 1 g"
+    return "m/s^2", 1.0, f"unit not named; norm at rest {rest:.4g}"
+
+
+def _remark_gravity(result, acc):
+    """Nothing tells the sign of gravity but the axis that points up, which nobody knows here."""
+    mean = np.nanmedian(acc, axis=0)
+    text = ("median (" + ", ".join(f"{v:.1f}" for v in mean)
+            + ") m/s^2: at rest +9.8 on the axis that points up, else turn it with rotation")
+    if mean[int(np.argmax(np.abs(mean)))] < 0:
+        result.doubts["accelerometer"] = text + "; does this axis point down, or is the sign wrong"
+    else:
+        result.remarks["accelerometer"] = text
+
+
+def _seconds(result, values):
+    """Times in s, or None."""
+    time = result.content["time"]
+    if "column" not in time or time["unit"] == "iso8601":
+        return None
+    factor = time.get("tick") or 10.0 ** (units.TIME[time["unit"]] - 9)
+    return values[time["column"]] * factor
+
+
+def _turned(columns, values):
+    """Vectors (n, 3) that stand still in the world, as far as is known: field, or gravity."""
+    for kind in ("magnetometer", "accelerometer"):
+        groups = _groups(columns, kind)
+        if groups:
+            yield np.column_stack([values[c.name] for c in next(iter(groups.values()))])
+
+
+def _rate_unit(written, data, vectors, time):
+    """(unit, counts per unit, what is doubtful) of a gyroscope. A vector v that stands still in
+    the world turns as dv/dt = -rate x v in the sensor, whatever the unit of v: that tells the unit
+    of the rate."""
+    unit = units.spelled(written, units.RATE)
+    if unit:
+        return unit, 1.0, ""
+    peak = float(np.nanmax(np.abs(data)))
+    whole = bool((data == np.round(data)).all()) and peak > _COUNTS
+    for vector in vectors if time is not None else ():
+        scale = _rad_per_unit(time, data, vector)
+        if scale is None:
+            continue
+        for name, factor in units.RATE.items():
+            if abs(np.log(scale / factor)) < 0.2:
+                return name, 1.0, "unit not named; its turning fits"
+        if whole:
+            counts = float(f"{np.radians(1.0) / scale:.3g}")
+            return "deg/s", counts, f"counts; its turning fits {counts:g} per deg/s"
+    if whole:
+        return "deg/s", 16.4, f"counts, greatest {peak:g}: 16.4 per deg/s is usual"
+    return ("deg/s" if peak > 12.0 else "rad/s"), 1.0, f"unit not named; greatest value {peak:.3g}"
+
+
+def _rad_per_unit(time, rate, vector):
+    """rad/s per unit of the rate; None where it does not turn enough, or does not fit."""
+    step = np.diff(time)
+    if not len(step) or not (np.isfinite(step) & (step > 0)).all():
+        return None
+    size = max(round(0.3 / float(np.median(step))), 1)
+    # The change of the vector over .3 s, and what a rate of 1 would have made of it.
+    made = np.cumsum(np.cross(rate, vector)[:-1] * step[:, None], axis=0)[size - 1::size]
+    made = np.diff(made, axis=0, prepend=np.zeros((1, 3)))
+    change = np.diff(vector[::size], axis=0)
+    n = min(len(made), len(change))
+    made, change = made[:n], change[:n]
+    fine = np.isfinite(made).all(axis=1) & np.isfinite(change).all(axis=1)
+    made, change = made[fine], change[fine]
+    total = float((change ** 2).sum())
+    if not total or not (made ** 2).sum():
+        return None
+    scale = -float((change * made).sum() / (made ** 2).sum())
+    left = float(((change + scale * made) ** 2).sum())
+    turned = np.sqrt(total / max(float(np.nanmean((vector ** 2).sum(axis=1))), 1e-300))
+    good = scale > 0 and turned > _LEAST_TURN and left < (1.0 - _WELL) * total
+    return scale if good else None
+
+
+def _sketch_gnss(result, columns, values):
+    have = {c.kind: c for c in columns if c.kind in ONES}
+
+    def unit(kind, known, usual, key):
+        found = units.spelled(have[kind].unit, known)
+        if found is None:
+            result.doubts[key] = f"unit of {have[kind].name} not named"
+        return found or usual
+
+    if {"lat", "lon", "height"} <= have.keys():
+        angle = units.spelled(have["lat"].unit, units.ANGLE)
+        peak = float(np.nanmax(np.abs(values[have["lon"].name])))
+        entry: dict[str, Any] = {
+            "columns": [have[k].name for k in ("lat", "lon", "height")],
+            "unit": angle or ("deg" if peak <= 360 else "1e-7 deg"),
+            "height_unit": unit("height", units.LENGTH, "m", "position")}
+        accuracy = [have[k].name for k in ("h_acc", "v_acc") if k in have]
+        if len(accuracy) == 2:
+            entry["accuracy"] = accuracy
+        if "fix" in have:
+            entry["fix"] = have["fix"].name
+        result.content["position"] = entry
+    frames = ((("north", "east", "down"), "ned"), (("east", "north", "up"), "enu"),
+              (("speed", "course"), "course"))
+    for kinds, frame in frames:
+        if set(kinds) <= have.keys():
+            result.content["velocity"] = {
+                "columns": [have[k].name for k in kinds], "frame": frame,
+                "unit": unit(kinds[0], units.SPEED, "m/s", "velocity")}
+            if "s_acc" in have:
+                result.content["velocity"]["accuracy"] = [have["s_acc"].name]
+            break
+    if {"qx", "qy", "qz", "qw"} <= have.keys():
+        result.content["reference"] = {"columns": [have[k].name for k in ("qx", "qy", "qz", "qw")]}
+        result.doubts["reference"] = "taken as world (east, north, up) <- imu"
+
+
+def _used(content):
+    for value in content.values():
+        if isinstance(value, dict):
+            yield from _used(value)
+        elif isinstance(value, list):
+            yield from (v for v in value if isinstance(v, str))
+        elif isinstance(value, str):
+            yield value
