@@ -15,7 +15,7 @@ import yaml
 from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.kernels import NOTICE
-from imu_fusion.signals import held
+from imu_fusion.signals import Interrupted, came, held
 
 _CLAIM = 9    # of the ports of a domain, the one that says that nodes will come
 _PATIENCE = 15.0  # s, in which nodes end their sessions and files
@@ -133,6 +133,8 @@ class NodeProcesses:
         deadline = time.monotonic() + timeout
         while self._processes[node].poll() is None:
             self._announce_compiling()
+            if came:
+                raise Interrupted(came[0])
             for name, process in self._processes.items():
                 if process.poll() not in (None, 0, INCOMPLETE):
                     raise NodeError(f"node {name} ended with code {process.returncode}: "
