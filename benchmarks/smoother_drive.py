@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.data import config, data_path
 from benchmarks.jumps import write
-from imu_fusion.estimation.smoother import Smoother
+from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.points import at_antenna
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
@@ -43,12 +44,14 @@ def load():
             VelocityLog(stamp, g[:, 7:10], np.zeros((len(stamp), 3, 3))), g[:, 3] == 1)
 
 
-def errors(result, fix):
+def errors(result, fix, params=PARAMS):
     """Errors (m, 3) of the smoothed antenna position at the fixes, with covariances, and the
     mask of fixes inside the recording. A fix shows where the antenna was when it was taken:
     its stamp less the delay that the run found."""
-    samples = result.samples
-    delay = int(round(result.states["gnss_time_offset"][0][0, 0] * 1e9))
+    samples = at_antenna(result.samples, result.states, params)
+    delay = 0
+    if "gnss_time_offset" in result.states:
+        delay = int(round(result.states["gnss_time_offset"][0][0, 0] * 1e9))
     stamp = fix.stamp - delay
     inside = (stamp > samples["stamp"][0]) & (stamp < samples["stamp"][-1])
     stamp = stamp[inside] - samples["stamp"][0]
@@ -59,17 +62,16 @@ def errors(result, fix):
     return place - truth, samples["cov_position"][nearest], inside
 
 
-def withheld(imu, fix, velocity, fixed):
-    """Result, 3D RMS in m and NEES inside the withheld stretches."""
+def withheld(imu, fix, velocity, fixed, params=PARAMS):
+    """Result, errors (m, 3) in m inside the withheld stretches, with covariances."""
     starts = np.linspace(imu.stamp[0] + 60e9, imu.stamp[-1] - 45e9, COUNT)
     hold = np.zeros(len(fix), bool)
     for start in starts:
         hold |= (fix.stamp >= start) & (fix.stamp < start + LENGTH * 1e9)
-    result = Smoother(PARAMS).run(imu, None, fix[~hold], velocity[~hold])
-    error, cov, inside = errors(result, fix)
+    result = Smoother(params).run(imu, None, fix[~hold], velocity[~hold])
+    error, cov, inside = errors(result, fix, params)
     use = (hold & fixed)[inside]
-    error, cov = error[use], cov[use]
-    return result, np.sqrt(np.mean(np.sum(error ** 2, axis=1))), nees(error, cov).mean()
+    return result, error[use], cov[use]
 
 
 def degraded(imu, fix, velocity, seed):
@@ -106,9 +108,11 @@ def main():
             f"{1e3 * result.states[k][0][0, 0]:.0f} +- {1e3 * result.states[k][1][0, 0]:.0f}"
             for k in ("gnss_time_offset", "velocity_time_offset"))
 
-    result, rms, ratio = withheld(imu, fix, velocity, fixed)
-    lines.append(f"| withheld {COUNT} x {LENGTH:.0f} s, 3D | {rms:.3f} | {ratio:.1f} | "
-                 f"{result.iterations} | {delays(result)} |")
+    for name, params in (("", PARAMS), (", defaults", SmootherParams())):
+        result, error, cov = withheld(imu, fix, velocity, fixed, params)
+        rms = np.sqrt(np.mean(np.sum(error ** 2, axis=1)))
+        lines.append(f"| withheld {COUNT} x {LENGTH:.0f} s, 3D{name} | {rms:.3f} | "
+                     f"{nees(error, cov).mean():.1f} | {result.iterations} | {delays(result)} |")
     rows = []
     for seed in range(SEEDS):
         result, axes, ratio = degraded(imu, fix, velocity, seed)

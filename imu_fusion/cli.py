@@ -383,6 +383,28 @@ def translate(file: str, out: str | None) -> None:
 
 
 @cli.command()
+@click.argument("table", type=click.Path())
+@click.option("--measuring-error", type=click.FloatRange(min=0.0), default=0.0, metavar="M",
+              help="Most that a measured length may be off, for the bound of the RMS.")
+def lengths(table: str, measuring_error: float) -> None:
+    """Compare smoothed jumps with measured lengths.
+
+    TABLE is a CSV file with the columns recording (an OUT of process or pipeline, relative to
+    TABLE) and measured (m).
+    """
+    from imu_fusion.evaluation.jump_length import JumpLengths
+    from imu_fusion.recordings.jump_table import read_lengths
+    jumps = JumpLengths(*read_lengths(table))
+    shown = Table("recording", "estimated m", "σ m", "measured m", "error m")
+    for row in zip(jumps.names, jumps.estimated, jumps.sd, jumps.measured, jumps.error):
+        shown.add_row(row[0], *(f"{value:.2f}" for value in row[1:4]), f"{row[4]:+.2f}")
+    console.print(shown)
+    click.echo(f"{len(jumps.names)} jumps: RMS {jumps.rms():.2f} m"
+               + (f", at most {jumps.rms(measuring_error):.2f} m where measured lengths are off by "
+                  f"up to {measuring_error:g} m" if measuring_error else ""))
+
+
+@cli.command()
 def compile() -> None:
     """Compile the kernels for this machine now, so that no node does when it starts."""
     from imu_fusion.compile_ahead import compile_ahead

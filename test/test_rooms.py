@@ -54,8 +54,8 @@ ARROWS = {
                "evaluation", "messages", "recordings", "streams", "batch"),
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
               "batch", "report"),
-    "cli": ("errors", "kernels", "parameters", "recordings", "streams", "compile_ahead", "nodes",
-            "batch", "report", "demos", "signals"),
+    "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",
+            "compile_ahead", "nodes", "batch", "report", "demos", "signals"),
 }
 # Arrows of one file, with the reason.
 ARROWS_OF_FILES = {

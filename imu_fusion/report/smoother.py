@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.points import at_antenna
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.state import BLOCKS
 from imu_fusion.evaluation.consistency import nees
@@ -58,12 +59,9 @@ class Smoothed:
 
     def antenna(self, stamp: np.ndarray) -> np.ndarray:
         """Position (m, 3) of the antenna at stamps of fixes, NaN outside of the samples."""
-        samples, states = self.result.samples, self.result.states
-        lever = states["gnss_lever_arm"][0] if "gnss_lever_arm" in states else \
-            np.tile(self.params.gnss.lever_arm, (len(samples), 1))
-        place = samples["position_world"] + Rotation.from_quat(
-            samples["quat_world_imu"]).apply(lever)
-        return interpolate(samples["stamp"], place, stamp - self.delay("gnss_time_offset"))
+        samples = at_antenna(self.result.samples, self.result.states, self.params)
+        return interpolate(samples["stamp"], samples["position_world"],
+                           stamp - self.delay("gnss_time_offset"))
 
 
 def interpolate(stamp: np.ndarray, columns: np.ndarray, at: np.ndarray) -> np.ndarray:

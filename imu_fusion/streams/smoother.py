@@ -7,7 +7,7 @@ end in :func:`smooth`, and so in the same messages.
 import json
 import math
 from collections.abc import Callable, Container, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -268,7 +268,13 @@ class Outcome:
         numbers: dict[str, Any] = {
             "samples": len(result.samples), "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
-            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag}
+            "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
+            "adapted": result.adapted, "noise": result.noise,
+            "outliers": {name: asdict(found) for name, found in result.outliers().items()}}
+        if result.gnss_step is not None:
+            numbers["gnss_step"] = {"stamp": result.gnss_step.stamp,
+                                    "offset": result.gnss_step.offset.tolist(),
+                                    "sd": result.gnss_step.sd.tolist()}
         if result.jump is not None:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()

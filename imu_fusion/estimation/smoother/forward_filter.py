@@ -58,8 +58,8 @@ def make_storage(n_samples: int, n_rows: int, n: int) -> Storage:
 
 @njit
 def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np.ndarray,
-                   cov: np.ndarray, recording: Recording, innovation: np.ndarray, storage: Storage,
-                   scratch: Scratch) -> float:
+                   cov: np.ndarray, recording: Recording, fit: np.ndarray, storage: Storage,
+                   scratch: Scratch) -> tuple[float, float]:
     """Filter samples first <= k < last; ``delta`` (n,) and ``cov`` (n, n) are those before the rows
     of ``first`` on entry, before the rows of ``last`` on return.
 
@@ -67,15 +67,16 @@ def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np
         follow: the nominal trajectory follows the filter (extended Kalman filter, writes x)
             instead of being kept (linear pass about x).
         x: nominal states (N, n + 1).
-        innovation: (M, 3) normalised innovations of the readings, result.
+        fit: (M,) of records.FIT, result.
         storage: result. scratch: of n error states.
 
     Returns:
-        Sum of the losses of all rows at the nominal trajectory.
+        Sum of the losses of all rows at the nominal trajectory; negative logarithm of the
+        likelihood of the whitened rows, linear about it.
     """
     n, store, model = len(delta), len(storage.delta) > 0, recording.model[0]
     step, rows = scratch.step[0], scratch.rows[0]
-    cost, stored = 0.0, 0
+    cost, surprise, stored = 0.0, 0.0, 0
     for k in range(first, last):
         has_interval = k < len(x) - 1
         if has_interval:
@@ -85,19 +86,15 @@ def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np
         if store:
             storage.row_start[k - first] = stored
         for m in range(recording.reading_start[k], recording.reading_start[k + 1]):
-            loss, weight = _linearise(recording.readings[m], x[k], follow, cov, step, model, rows)
+            loss, unlikely, stored = _take_reading(recording.readings[m], x[k], follow, delta, cov,
+                                                   step, model, rows, fit[m], storage, stored)
             cost += loss
-            for i in range(3):
-                _put_component(i, weight, n, rows)
-                # Readings of fewer than three components have empty rows.
-                if rows.length > 0:
-                    value, root = _update(delta, cov, rows, weight * rows.residual[i])
-                    innovation[m, i] = value
-                    stored = _store_row(stored, value, root, rows, storage)
+            surprise += unlikely
         for c in range(recording.contact_start[k], recording.contact_start[k + 1]):
             residual = put_row(recording.contacts[c], x[k], model, rows)
             cost += residual ** 2
             value, root = _update(delta, cov, rows, residual)
+            surprise += _surprise(value, root)
             stored = _store_row(stored, value, root, rows, storage)
         if follow:
             boxplus(x[k], delta)
@@ -114,7 +111,33 @@ def filter_segment(first: int, last: int, follow: bool, x: np.ndarray, delta: np
                 storage.f_vel[k - first] = step.f_vel[:, :n]
                 storage.f_att[k - first] = step.f_att[:, :n]
                 storage.spread[k - first] = step.spread
-    return cost
+    return cost, surprise
+
+
+@njit
+def _take_reading(reading, x, follow, delta, cov, step, model, rows, fit, storage, stored):
+    """Update by the rows of a reading; returns its loss, the negative logarithm of its likelihood,
+    and how many rows are kept."""
+    n = len(delta)
+    loss, weight = _linearise(reading, x, follow, cov, step, model, rows)
+    # A weighted square touches the loss from above, where the nominal trajectory is.
+    surprise = 0.5 * loss
+    for i in range(3):
+        _put_component(i, weight, n, rows)
+        # Readings of fewer than three components have empty rows.
+        if rows.length > 0:
+            value, root = _update(delta, cov, rows, weight * rows.residual[i])
+            surprise += _surprise(value, root) - 0.5 * (weight * rows.residual[i]) ** 2
+            fit.innovation[i], fit.residual[i] = value, rows.residual[i]
+            stored = _store_row(stored, value, root, rows, storage)
+    return loss, surprise, stored
+
+
+@njit
+def _surprise(innovation, root):
+    """Negative logarithm of the density of a normalised innovation, before it is divided by the
+    root of its variance; without the constant."""
+    return 0.5 * innovation * innovation + math.log(root)
 
 
 @njit

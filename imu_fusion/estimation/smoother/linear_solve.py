@@ -19,24 +19,24 @@ SEGMENT = 128
 
 @njit
 def solve_linear(x: np.ndarray, delta: np.ndarray, cov: np.ndarray, recording: Recording,
-                 innovation: np.ndarray, cov_out: np.ndarray, var_out: np.ndarray
-                 ) -> tuple[float, float, np.ndarray]:
+                 fit: np.ndarray, cov_out: np.ndarray, var_out: np.ndarray
+                 ) -> tuple[float, float, float, np.ndarray]:
     """Solve the problem linearised about x (N, n + 1) and move x to its solution.
 
     Args:
         delta, cov: prior deviation (n,) and covariance (n, n) of the first sample.
-        innovation: (M, 3) normalised innovations of the readings, result.
+        fit: (M,) of records.FIT, result.
         cov_out, var_out: as in :class:`.backward_pass.Smoothed`, results.
 
     Returns:
-        Loss of all rows before the step, squared normalised process noise after it, largest
-        changes (3,) of position, velocity and attitude.
+        Loss of all rows before the step, negative logarithm of their likelihood, squared normalised
+        process noise after the step, largest changes (3,) of position, velocity and attitude.
     """
     total, n = len(x), len(delta)
     count = (total + SEGMENT - 1) // SEGMENT
     kept_delta, kept_cov = np.empty((count, n)), np.empty((count, n, n))
     readings, contacts = recording.reading_start, recording.contact_start
-    most, cost, process = 0, 0.0, 0.0
+    most, cost, surprise, process = 0, 0.0, 0.0, 0.0
     # A constant would have the filter compiled a second time for it.
     follow = np.zeros(1, np.bool_)[0]
     nothing, scratch = make_storage(0, 0, n), make_scratch(n)
@@ -44,15 +44,17 @@ def solve_linear(x: np.ndarray, delta: np.ndarray, cov: np.ndarray, recording: R
         first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
         kept_delta[s], kept_cov[s] = delta, cov
         most = max(most, 3 * (readings[last] - readings[first]) + contacts[last] - contacts[first])
-        cost += filter_segment(first, last, follow, x, delta, cov, recording, innovation, nothing,
-                               scratch)
+        loss, unlikely = filter_segment(first, last, follow, x, delta, cov, recording, fit, nothing,
+                                        scratch)
+        cost += loss
+        surprise += unlikely
     storage = make_storage(SEGMENT, most, n)
     smoothed, largest = Smoothed(np.empty((SEGMENT, n)), cov_out, var_out), np.zeros(3)
     adjoint = Adjoint(np.zeros(n), np.zeros((n, n)))
     for s in range(count - 1, -1, -1):
         first, last = s * SEGMENT, min((s + 1) * SEGMENT, total)
-        filter_segment(first, last, follow, x, kept_delta[s], kept_cov[s], recording, innovation,
+        filter_segment(first, last, follow, x, kept_delta[s], kept_cov[s], recording, fit,
                        storage, scratch)
         process += smooth_segment(first, last, adjoint, recording, storage, smoothed, scratch)
         apply_step(x[first:last], smoothed.step, largest)
-    return cost, process, largest
+    return cost, surprise, process, largest

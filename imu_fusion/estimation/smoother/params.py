@@ -196,6 +196,7 @@ class Iteration(Parameters):
 #: Groups and parameters that the paper's method has from its tables 3 and 5, or does not know.
 #: Prefixes end in a dot.
 _NOT_IN_THE_PAPER = (
+    "maximum_likelihood",
     "sensor.gyro_bias_sd", "sensor.gyro_bias_walk", "sensor.gyro_scale_sd", "sensor.acc_bias_sd",
     "sensor.acc_bias_walk", "sensor.acc_matrix_sd", "sensor.mag_noise_sd", "sensor.mag_bias_sd",
     "sensor.mag_scale_sd", "gnss.fix_sd", "gnss.velocity_sd", "gnss.covariances", "gnss.loss",
@@ -247,6 +248,10 @@ class SmootherParams(Parameters):
         None, unit="T", length=3, doc="Magnetic field east, north, up; unset: that of the World "
         "Magnetic Model at the origin and the first stamp. Set it where iron bends the field of "
         "the whole site.")
+    maximum_likelihood: str = param(
+        "misfit", choices=("off", "misfit"), doc="misfit: where innovations wander or are larger "
+        "than stated, delays, walks of biases, wandering errors of the receiver and the noise of "
+        "all are fitted to the recording, and a remark names what was taken; off: never.")
     sensor: Sensor = Sensor()
     gap: Gap = Gap()
     gnss: Gnss = Gnss()

@@ -1,7 +1,7 @@
 """One recording as an optimisation problem: its trajectory, and the step that improves it."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +11,12 @@ from imu_fusion.estimation.smoother.forward_filter import filter_segment, make_s
 from imu_fusion.estimation.smoother.imu_input import ImuInput
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.linear_solve import solve_linear
-from imu_fusion.estimation.smoother.measurements.registry import DELAYS, FIX, MEASUREMENTS
+from imu_fusion.estimation.smoother.measurements.registry import (
+    DELAYS,
+    FIX,
+    KINDS,
+    MEASUREMENTS,
+)
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
     evaluate_constraints,
     put_lever_derivatives,
@@ -19,8 +24,17 @@ from imu_fusion.estimation.smoother.measurements.surface_contact import (
 )
 from imu_fusion.estimation.smoother.motion import columns_of, intervals_of
 from imu_fusion.estimation.smoother.params import SmootherParams
-from imu_fusion.estimation.smoother.records import CONTACT, MODEL, Recording, make_scratch
-from imu_fusion.estimation.smoother.state import ATT, POS, SLOW, StatePrior, boxminus, slow_states
+from imu_fusion.estimation.smoother.records import CONTACT, FIT, MODEL, Recording, make_scratch
+from imu_fusion.estimation.smoother.state import (
+    ACC_BIAS,
+    ATT,
+    GYR_BIAS,
+    POS,
+    SLOW,
+    StatePrior,
+    boxminus,
+    slow_states,
+)
 from imu_fusion.estimation.smoother.surroundings import Surroundings
 from imu_fusion.surfaces.constraint import Constraint
 
@@ -34,11 +48,13 @@ _JUDGED = 25.0
 
 @dataclass(frozen=True)
 class Change:
-    """What a step did: ``largest`` changes (3,) in m, m/s, rad. If it was asked to: covariances
+    """What a step did: ``largest`` changes (3,) in m, m/s, rad; negative logarithm ``surprise``
+    of the likelihood of all rows before it. If it was asked to: covariances
     ``cov`` (N, 3, 3, 3) of position, velocity, attitude, and variances ``var`` (N, n - 9) of the
     slow states."""
 
     largest: np.ndarray
+    surprise: float = np.inf
     cov: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 3, 3)))
     var: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
@@ -59,6 +75,12 @@ def model_of(prior: StatePrior, around: Surroundings, lever_arm: Sequence[float]
     values["decay_rate"][:n], values["walk"][:n] = prior.decay_rate, prior.walk
     values["columns"][:len(columns)], values["n_columns"] = columns, len(columns)
     return model
+
+
+def log_density(readings: np.ndarray) -> float:
+    """What whitening readings of records.READING does to the logarithm of their likelihood."""
+    sizes = np.diagonal(readings["whiten"], axis1=1, axis2=2)
+    return float(np.log(sizes[sizes > 0.0]).sum())
 
 
 class Problem:
@@ -104,7 +126,7 @@ class Problem:
         ``bind`` anew at the sample before each, else after the sample that each is bound to,
         unless the delays have moved by more than a step since.
 
-        Sets ``readings`` (M,), ``reading_start`` (N + 1,) and ``innovation`` (M, 3).
+        Sets ``readings`` (M,), ``reading_start`` (N + 1,) and ``fit`` (M,), of records.FIT.
         """
         stamp = self.imu.log.stamp
         late = np.array([sum(self._delay(name) for name in m.delays) for m in MEASUREMENTS])
@@ -131,7 +153,7 @@ class Problem:
         sample = np.minimum(sample, len(stamp) - 2)
         self._order = order
         self.reading_start = np.searchsorted(sample, np.arange(len(stamp) + 1))
-        self.innovation = np.zeros((len(order), 3))
+        self.fit = np.zeros(len(order), FIT)
 
     def follow(self, count: int | None = None) -> float:
         """Extended Kalman filter over the first ``count`` samples; writes x.
@@ -144,8 +166,8 @@ class Problem:
         count = len(self.x) if count is None else count
         n = self.size
         filter_segment(0, count, True, self.x, np.zeros(n), np.diag(self.prior_sd ** 2),
-                       self.recording, self.innovation, make_storage(0, 0, n), make_scratch(n))
-        squares = (self.innovation[:self.reading_start[count]] ** 2).sum(axis=1)
+                       self.recording, self.fit, make_storage(0, 0, n), make_scratch(n))
+        squares = (self.fit["innovation"][:self.reading_start[count]] ** 2).sum(axis=1)
         return float(np.log1p(squares / _JUDGED).sum())
 
     def rank(self, candidates: np.ndarray) -> np.ndarray:
@@ -180,6 +202,33 @@ class Problem:
         other.attach()
         return other
 
+    def log_likelihood(self, noise: Sequence[float], walk: Sequence[float],
+                       receiver: Mapping[str, float], most: int) -> float:
+        """Logarithm of the likelihood of the readings of the first ``most`` samples, linear about
+        the trajectory, but for a constant.
+
+        Args:
+            noise, walk: factors (2,) of the noise of rates and forces and of the walks of their
+                biases. receiver: name of readings -> factor of their standard deviations.
+        """
+        n, count = self.size, min(most, len(self.x))
+        intervals = self.intervals.copy()
+        readings = self.readings[:self.reading_start[count]].copy()
+        model = self.model.copy()
+        for name, first, factor, drift in zip(("gyr_noise", "acc_noise"), (GYR_BIAS, ACC_BIAS),
+                                              noise, walk):
+            intervals[name] *= factor ** 2
+            model["walk"][0, first:first + 3] *= drift ** 2
+        for name, factor in receiver.items():
+            readings["whiten"][readings["kind"] == KINDS[name]] /= factor
+        delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
+        boxminus(self.mean, self.x[0], delta)
+        _, surprise = filter_segment(
+            0, count, False, self.x, delta, cov,
+            self.recording._replace(model=model, intervals=intervals, readings=readings),
+            self.fit.copy(), make_storage(0, 0, n), make_scratch(n))
+        return log_density(readings) - surprise
+
     def _surface_lever(self):
         """Lever arm (3,) or (N, 3) m of the point that is held on the surface."""
         i = self.blocks.surface_lever_arm
@@ -211,8 +260,8 @@ class Problem:
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
         covariances = np.empty((total if with_cov else 0, 3, 3, 3))
         variances = np.empty((total if with_cov else 0, n - SLOW))
-        cost, process, largest = solve_linear(self.x, delta, cov, self.recording, self.innovation,
-                                              covariances, variances)
+        cost, surprise, process, largest = solve_linear(
+            self.x, delta, cov, self.recording, self.fit, covariances, variances)
         self.cost.append(0.5 * (prior_cost + cost + self._process))
         self._process = process
         # A delay that runs away beyond belief takes the measurements with it.
@@ -224,4 +273,4 @@ class Problem:
             sampled = np.append(np.arange(0, total - 1, THINNING), total - 1)
             for column in variances.T:
                 column[:] = np.interp(np.arange(total), sampled, column[sampled])
-        return Change(largest, covariances, variances)
+        return Change(largest, surprise, covariances, variances)

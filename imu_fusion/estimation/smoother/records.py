@@ -21,6 +21,10 @@ INTERVAL = np.dtype([("dt", "f8"), ("gyr", "f8", 3), ("acc", "f8", 3), ("gyr_noi
 READING = np.dtype([("stamp", "i8"), ("kind", "i8"), ("tau", "f8"), ("value", "f8", 3),
                     ("whiten", "f8", (3, 3)), ("loss", "f8")], align=True)
 
+#: What the filter makes of one reading, component by component: normalised innovation; whitened
+#: residual at the nominal trajectory, by which the loss is judged.
+FIT = np.dtype([("innovation", "f8", 3), ("residual", "f8", 3)], align=True)
+
 #: One row of a surface: m above it, its derivatives, sigma (m); whether it is a height.
 CONTACT = np.dtype([("residual", "f8"), ("position", "f8", 3), ("attitude", "f8", 3),
                     ("lever_arm", "f8", 3), ("sigma", "f8"), ("height", "?")], align=True)

@@ -47,6 +47,7 @@ class StateBlocks(NamedTuple):
     body_height: int = -1
     surface_lever_arm: int = -1
     gnss_velocity_error: int = -1
+    gnss_step: int = -1
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,8 @@ BLOCKS = (
           lambda p: p.surface.lever_arm_sd, mean=lambda p: p.surface.lever_arm),
     Block("gnss_velocity_error", "GNSS velocity error", "m/s", 1.0, _ENU,
           lambda p: p.gnss.velocity_error_sd, tau=lambda p: p.gnss.velocity_error_tau),
+    Block("gnss_step", "step of the fixes", "m", 1.0, _ENU, lambda p: p.initial.position_sd,
+          needs="moved_fix"),
 )
 
 # Least standard deviation of a Gauss-Markov component, in m or m/s: one that is given as zero

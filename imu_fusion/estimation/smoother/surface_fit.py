@@ -4,16 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
     evaluate_constraints,
     holds,
-    surface_points,
 )
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.surfaces.constraint import Constraint
 
 _STRETCH = 1.0  # s, over which deviations are averaged: slower than what the Imu itself holds
@@ -41,44 +40,6 @@ class SurfaceFit:
     excess: float
     first_excess: float = 0.0
     silent: float = 0.0
-
-
-def at_surface(samples: np.ndarray, states: dict[str, tuple[np.ndarray, np.ndarray]],
-               params: SmootherParams) -> np.ndarray:
-    """Samples whose position and velocity, with covariances, are those of the point that is held
-    on the surface: p + R l, v + R (w x l).
-
-    The errors of position, velocity, attitude, lever arm and rate count as uncorrelated. Across
-    the surface they are not, and the point is known better than that.
-
-    Args:
-        samples, states: of the SmootherResult.
-        params: SmootherParams.
-    """
-    lever, lever_sd = states.get("surface_lever_arm", (np.array(params.surface.lever_arm), 0.0))
-    if not np.any(lever):
-        return samples
-    lever = np.broadcast_to(lever, samples["position_world"].shape)
-    lever_cov = np.broadcast_to(lever_sd, lever.shape)[:, None] ** 2 * np.eye(3)
-    gyr_cov = samples["gyr_sd"][:, None] ** 2 * np.eye(3)
-    turn = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"]).as_matrix()
-    swing = np.cross(samples["gyr"], lever)
-
-    def crossed(v):
-        """R [v]x: the rows of R, each crossed with v."""
-        return np.cross(turn, v[:, None])
-
-    moved = samples.copy()
-    moved["position_world"] = surface_points(samples["position_world"],
-                                             samples["quat_world_imu"], lever)
-    moved["vel_world"] += np.einsum("nij,nj->ni", turn, swing)
-    for name, parts in (
-            ("cov_position", ((crossed(lever), samples["cov_attitude"]), (turn, lever_cov))),
-            ("cov_velocity", ((crossed(swing), samples["cov_attitude"]),
-                              (crossed(lever), gyr_cov), (crossed(samples["gyr"]), lever_cov)))):
-        for by, cov in parts:
-            moved[name] += by @ cov @ by.swapaxes(1, 2)
-    return moved
 
 
 def surface_fits(constraints: Sequence[Constraint], samples: np.ndarray,

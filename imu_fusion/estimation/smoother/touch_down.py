@@ -11,8 +11,9 @@ import numpy as np
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, table_crossing
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.result import SmootherResult
-from imu_fusion.estimation.smoother.surface_fit import SurfaceFit, at_surface
+from imu_fusion.estimation.smoother.surface_fit import SurfaceFit
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.surfaces.constraint import Constraint
 from imu_fusion.surfaces.hill import Hill

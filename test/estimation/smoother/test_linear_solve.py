@@ -8,6 +8,7 @@ from imu_fusion.estimation.smoother.linear_solve import SEGMENT, solve_linear
 from imu_fusion.estimation.smoother.measurements import registry
 from imu_fusion.estimation.smoother.records import (
     CONTACT,
+    FIT,
     INTERVAL,
     MODEL,
     READING,
@@ -151,8 +152,9 @@ def test_solver_agrees_with_dense_algebra():
 
     moved = x.copy()
     cov_out, var_out = np.empty((count, 3, 3, 3)), np.zeros((count, n - SLOW))
-    _, process, largest = solve_linear(moved, prior_delta.copy(), np.diag(prior_sd ** 2), recording,
-                                       np.zeros((5, 3)), cov_out, var_out)
+    _, surprise, process, largest = solve_linear(
+        moved, prior_delta.copy(), np.diag(prior_sd ** 2), recording, np.zeros(5, FIT), cov_out,
+        var_out)
     for k in range(count):
         target = x[k].copy()
         boxplus(target, expected[k])
@@ -162,6 +164,9 @@ def test_solver_agrees_with_dense_algebra():
             inner = slice(3 * block, 3 * block + 3)
             assert np.allclose(cov_out[k, block], full[inner, inner], rtol=1e-8, atol=1e-10)
     assert np.allclose(var_out[0], np.diag(maps[0] @ posterior @ maps[0].T)[SLOW:], atol=1e-10)
+    spread = h_all @ prior @ h_all.T + np.eye(len(h_all))
+    assert np.isclose(surprise, 0.5 * (r_all @ np.linalg.solve(spread, r_all)
+                                       + np.linalg.slogdet(spread)[1]))
     positive = variance[n:] > 0
     assert np.isclose(process, np.sum(noises[n:][positive] ** 2 / variance[n:][positive]))
     assert np.isclose(largest[0], np.linalg.norm(expected[:, :3], axis=1).max())
@@ -189,11 +194,11 @@ def test_segments_change_nothing():
     x, recording = long_problem(np.random.default_rng(5), 2 * SEGMENT + 17)
     count, n, m = len(x), x.shape[1] - 1, len(recording.readings)
     moved, none = x.copy(), (np.empty((0, 3, 3, 3)), np.empty((0, n - SLOW)))
-    solve_linear(moved, np.zeros(n), np.eye(n), recording, np.zeros((m, 3)), *none)
+    solve_linear(moved, np.zeros(n), np.eye(n), recording, np.zeros(m, FIT), *none)
     # One segment as long as the whole.
     storage, scratch = make_storage(count, 3 * m, n), make_scratch(n)
     smoothed = Smoothed(np.empty((count, n)), *none)
-    filter_segment(0, count, False, x, np.zeros(n), np.eye(n), recording, np.zeros((m, 3)), storage,
+    filter_segment(0, count, False, x, np.zeros(n), np.eye(n), recording, np.zeros(m, FIT), storage,
                    scratch)
     smooth_segment(0, count, Adjoint(np.zeros(n), np.zeros((n, n))), recording, storage, smoothed,
                    scratch)
@@ -208,13 +213,13 @@ def test_a_reading_of_one_component_is_one_row():
     n, m, readings = x.shape[1] - 1, len(recording.readings), recording.readings.copy()
     for reading in readings:
         reading["whiten"], reading["value"] = np.diag([1.0, 0.0, 0.0]), [reading["value"][0], 7, 7]
-    innovation, none = np.zeros((m, 3)), (np.empty((0, 3, 3, 3)), np.empty((0, n - SLOW)))
+    fit, none = np.zeros(m, FIT), (np.empty((0, 3, 3, 3)), np.empty((0, n - SLOW)))
     moved = x.copy()
-    cost, _, _ = solve_linear(moved, np.zeros(n), np.eye(n), recording._replace(readings=readings),
-                              innovation, *none)
-    assert innovation[:, 0].all() and not innovation[:, 1:].any()
+    cost, _, _, _ = solve_linear(moved, np.zeros(n), np.eye(n),
+                                 recording._replace(readings=readings), fit, *none)
+    assert fit["innovation"][:, 0].all() and not fit["innovation"][:, 1:].any()
     assert np.isclose(cost, np.sum(readings["value"][:, 0] ** 2), rtol=1e-3)
     free = x.copy()
     solve_linear(free, np.zeros(n), np.eye(n), recording._replace(
-        readings=readings[:0], reading_start=0 * recording.reading_start), np.zeros((0, 3)), *none)
+        readings=readings[:0], reading_start=0 * recording.reading_start), np.zeros(0, FIT), *none)
     assert np.allclose(moved[:, 2], free[:, 2], rtol=0, atol=1e-3)

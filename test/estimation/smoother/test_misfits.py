@@ -48,14 +48,49 @@ def test_a_receiver_of_another_clock_is_noticed_and_put_right(logs, clean, lag):
     assert apart.max() < 3 * np.sqrt(np.trace(result.samples["cov_position"][both].mean(axis=0)))
 
 
-@pytest.mark.parametrize("step", [5.0, 48.0])
-def test_a_step_of_the_height_datum_is_said_and_widens_what_is_stated(logs, clean, step):
+def up_error(result, fix):
+    """m, and its standard deviation, at the samples: the drive is level."""
+    height = result.frame.to_geodetic(result.samples["position_world"])[2]
+    return height - fix.height.mean(), np.sqrt(result.samples["cov_position"][:, 2, 2])
+
+
+@pytest.mark.parametrize(("step", "begin", "with_velocity"), [
+    (48.0, 0.5, True), (48.0, 0.7, True), (-15.0, 0.4, True), (48.0, 0.5, False)])
+def test_a_step_of_the_height_datum_is_found_and_said(logs, step, begin, with_velocity):
     imu, mag, fix, velocity = logs
-    height = fix.height + step * (np.arange(len(fix)) > len(fix) // 2)
-    result = Smoother(PARAMS).run(imu, mag, dataclasses.replace(fix, height=height), velocity)
+    first = int(begin * len(fix))
+    height = fix.height + step * (np.arange(len(fix)) >= first)
+    result = Smoother(PARAMS).run(imu, mag, dataclasses.replace(fix, height=height),
+                                  velocity if with_velocity else None)
+    found = result.gnss_step
+    assert abs(found.stamp - fix.stamp[first]) < 3e9    # three seconds: 15 m are 3 sd of a fix
+    assert abs(found.offset[2] - step) < 3 * found.sd[2]
+    assert any("another height datum" in remark for remark in result.remarks())
+    error, sd = up_error(result, fix)
+    assert (np.abs(error) < 3 * sd).mean() > 0.97 and np.median(sd) < 2.0
+
+
+def test_errors_that_wander_are_no_step_and_widen_what_is_stated(logs, clean):
+    imu, mag, fix, velocity = logs
+    t = (fix.stamp - fix.stamp[0]) * 1e-9
+    wandering = dataclasses.replace(fix, height=fix.height + 15.0 * np.sin(0.6 * t))
+    result = Smoother(PARAMS).run(imu, mag, wandering, velocity)
+    assert result.gnss_step is None
     assert any("the fix innovations wander" in remark for remark in result.remarks())
     up = result.samples["cov_position"][:, 2, 2] / clean.samples["cov_position"][:, 2, 2]
     assert np.median(up) > 1.5 ** 2
+
+
+def test_fixes_of_which_many_are_rejected_are_said(logs):
+    """Ten seconds of fixes beside the path, as between houses: the loss lets go of them."""
+    imu, mag, fix, velocity = logs
+    t = (fix.stamp - fix.stamp[0]) * 1e-9
+    beside = (t > 15.0) & (t < 25.0)
+    shifted = dataclasses.replace(fix, longitude_deg=fix.longitude_deg + 1e-3 * beside)
+    result = Smoother(PARAMS).run(imu, mag, shifted, velocity)
+    found = result.outliers()["fix"]
+    assert abs(found.share - beside.mean()) < 0.02 and found.longest >= 0.9 * beside.sum()
+    assert any("in a row" in remark and "fix" in remark for remark in result.remarks())
 
 
 def test_fixes_of_a_receiver_that_knows_nothing_yet_are_left_out_and_counted(logs, clean):

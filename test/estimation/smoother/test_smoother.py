@@ -147,10 +147,12 @@ def test_wandering_position_error_needs_its_state(jump):
 
 def test_filtered_velocities_need_their_state(jump):
     """A receiver's filter makes its velocity errors wander: as white ones they would be believed
-    too much (NEES 36), were it not noticed; with their state there is nothing to notice."""
+    too much (NEES 36), were it not noticed; with their state there is nothing to notice. Without
+    being told the smoother finds that they wander."""
     sd = tuple(np.sqrt(0.95) * np.array(Gnss().velocity_sd))
-    models = (SmootherParams(),
-              SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)))
+    models = (SmootherParams(maximum_likelihood="off"),
+              SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)),
+              SmootherParams())
     found = []
     for seed in range(4):
         filtered = record(jump, np.random.default_rng(seed), gnss=GnssErrors(velocity_tau=1.0))
@@ -159,9 +161,10 @@ def test_filtered_velocities_need_their_state(jump):
             r = Smoother(params).run(filtered.imu, filtered.mag, filtered.fix, filtered.velocity)
             found.append((nees(r.samples["vel_world"] - truth, r.samples["cov_velocity"]).mean(),
                           r.wander["velocity"]))
-    (white, states), (noticed, none) = np.mean(np.reshape(found, (4, 2, 2)), axis=0).T
+        assert "gnss.velocity_error_sd" in r.adapted
+    (white, states, adapted), (noticed, *none) = np.mean(np.reshape(found, (4, 3, 2)), axis=0).T
     # Ideal 3; ten seeds of the benchmark give 3.2 with states.
-    assert 1.0 < states < 6.0 and none == 1.0
+    assert 1.0 < states < 6.0 and 1.0 < adapted < 6.0 and none == [1.0, 1.0]
     assert 1.0 < white < 6.0 and noticed > 2.0 and white * noticed ** 2 > 15.0
 
 
@@ -288,14 +291,18 @@ def test_a_result_to_be_doubted_says_why(jump, recording, result):
     # Fixes of 3 m and 5 m that claim to be ten times better, without the loss that hides it.
     fix = dataclasses.replace(recording.fix, cov_enu=np.broadcast_to(
         np.diag([0.09, 0.09, 0.25]), (len(recording.fix), 3, 3)))
-    claimed = Smoother(SmootherParams(gnss=Gnss(loss="squared"))).run(
-        recording.imu, recording.mag, fix, recording.velocity)
+    believed = SmootherParams(gnss=Gnss(loss="squared"), maximum_likelihood="off")
+    claimed = Smoother(believed).run(recording.imu, recording.mag, fix, recording.velocity)
     assert claimed.misfit()["fix"] > 5.0
     assert any("fix innovations" in text and "gnss.fix_sd" in text for text in claimed.remarks())
     # As the remark advises: what the messages claim is not taken.
     own = Smoother(SmootherParams(gnss=Gnss(loss="squared", covariances=False))).run(
         recording.imu, recording.mag, fix, recording.velocity)
     assert abs(own.misfit()["fix"] - 1.0) < 0.2 and own.remarks() == []
+    # Or found without being told.
+    fitted = Smoother(SmootherParams()).run(recording.imu, recording.mag, fix, recording.velocity)
+    assert 7.0 < fitted.noise["fix"] < 13.0 and abs(fitted.misfit()["fix"] - 1.0) < 0.2
+    assert any("times the stated standard deviations of fix" in t for t in fitted.remarks())
 
 
 def test_given_events_are_used_without_velocities(jump, recording):

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
+from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.result import SAMPLE
-from imu_fusion.estimation.smoother.surface_fit import at_surface
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, record
 from imu_fusion.simulation.ski_jump import SkiJump

@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from imu_fusion.estimation.smoother.measurements import gnss_fix, gnss_velocity, magnetometer
+from imu_fusion.estimation.smoother.measurements import (
+    gnss_fix,
+    gnss_moved_fix,
+    gnss_velocity,
+    magnetometer,
+)
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import READING
 from imu_fusion.geometry.geodesy import LocalFrame
@@ -10,8 +15,12 @@ from imu_fusion.kernels import njit
 from imu_fusion.samples.logs import Log
 
 #: Kinds of readings are indices into this.
-MEASUREMENTS = (gnss_fix.MEASUREMENT, gnss_velocity.MEASUREMENT, magnetometer.MEASUREMENT)
-FIX, VELOCITY, MAG = range(len(MEASUREMENTS))
+MEASUREMENTS = (gnss_fix.MEASUREMENT, gnss_velocity.MEASUREMENT, magnetometer.MEASUREMENT,
+                gnss_moved_fix.MEASUREMENT)
+FIX, VELOCITY, MAG, MOVED_FIX = range(len(MEASUREMENTS))
+
+#: Name -> kind.
+KINDS = {m.name: kind for kind, m in enumerate(MEASUREMENTS)}
 
 #: Names of the states that are delays of stamps.
 DELAYS = tuple(dict.fromkeys(name for m in MEASUREMENTS for name in m.delays))
@@ -34,6 +43,8 @@ def predict(kind, x, tau, step, model, rows):
         gnss_velocity.predict(x, tau, step, model, rows)
     elif kind == MAG:
         magnetometer.predict(x, tau, step, model, rows)
+    elif kind == MOVED_FIX:
+        gnss_moved_fix.predict(x, tau, step, model, rows)
 
 
 def prepare_readings(logs: dict[str, Log | None], frame: LocalFrame, params: SmootherParams

@@ -1,0 +1,203 @@
+"""One attempt: a recording smoothed under one model of it."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.smoother.gnss_step import GnssStep
+from imu_fusion.estimation.smoother.imu_input import first_place, prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.initial import first_attitudes
+from imu_fusion.estimation.smoother.iterated import Solution, solve
+from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
+from imu_fusion.estimation.smoother.jump_result import jump_result
+from imu_fusion.estimation.smoother.measurements.registry import (
+    KINDS,
+    MEASUREMENTS,
+    prepare_readings,
+)
+from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.points import at_surface
+from imu_fusion.estimation.smoother.problem import Problem, log_density
+from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
+from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
+from imu_fusion.estimation.smoother.state import StatePrior
+from imu_fusion.estimation.smoother.surface_fit import (
+    misfit_at_landing,
+    surface_fits,
+)
+from imu_fusion.estimation.smoother.surroundings import surroundings_of
+from imu_fusion.estimation.smoother.touch_down import likeliest
+from imu_fusion.estimation.smoother.whiteness import wandering, widen
+from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.samples.logs import FixLog, ImuLog, Log, MagLog, VelocityLog
+from imu_fusion.surfaces.constraint import Surface
+from imu_fusion.surfaces.hill import Hill
+
+# A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
+_STARTS = 4          # first attitudes tried until one fits
+_PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
+
+
+class Given(NamedTuple):
+    """Arguments of :meth:`.smoother.Smoother.run`."""
+
+    imu: ImuLog
+    mag: MagLog | None
+    fix: FixLog | None
+    velocity: VelocityLog | None
+    events: JumpEvents | None
+    initial_quat: np.ndarray | None
+
+    def earlier(self, lag: float) -> "Given":
+        """With stamps of the receiver that are earlier by a lag (s)."""
+        late, fix, velocity = np.int64(round(lag * 1e9)), self.fix, self.velocity
+        return self._replace(
+            fix=None if fix is None else replace(fix, stamp=fix.stamp - late),
+            velocity=None if velocity is None else replace(velocity, stamp=velocity.stamp - late))
+
+
+class Model(NamedTuple):
+    """What is taken to be true of a recording: ``params``; ``step_at``, stamp (ns) of the first
+    fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
+    standard deviations."""
+
+    params: SmootherParams
+    step_at: int | None = None
+    noise: Mapping[str, float] = {}
+
+    def changed(self, changes: Mapping[str, Any]) -> "Model":
+        """With other values of parameters, by their dotted names."""
+        return self._replace(params=self.params.replace(**changes))
+
+
+class Attempt(NamedTuple):
+    """A solved problem, and what it says."""
+
+    problem: Problem
+    result: SmootherResult
+
+
+def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
+    """Smooth a recording under a model of it.
+
+    Raises: as :meth:`.smoother.Smoother.run`.
+    """
+    params = model.params
+    prepared = prepare_imu(given.imu, params)
+    first = first_place(given.fix, params.initial.position)
+    frame = reference_frame(surface, first)
+    constraints = surface.constraints() if surface is not None else ()
+    events = given.events
+    detected = events is None and any(c.phase != "always" for c in constraints)
+    if detected:
+        events = find_jump(prepared.log, given.velocity, params.jump.takeoff,
+                           params.jump.touchdown)
+    readings = _readings(given, model, frame)
+    measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
+    around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
+    problem = Problem(prepared, params, readings, around, constraints,
+                      StatePrior.of(params, measured))
+    hill = surface if isinstance(surface, Hill) and events is not None else None
+    start = None if params.initial.position is None else frame.to_enu(*first)
+    judge = "fix" if "fix" in measured else "mag"
+    best = None
+    for quat in first_attitudes(problem, given.mag, given.initial_quat, start)[:_STARTS]:
+        found = _from_attitude(problem, frame, hill, quat, events)
+        if found is None:
+            continue
+        if best is None or found.result.cost[-1] < best.result.cost[-1]:
+            best = found
+        if found.result.converged and found.result.misfit().get(judge, 0.0) < _PLAUSIBLE:
+            break
+    if best is None:
+        raise EstimationError("the smoother diverged: noise far below that of the data, or "
+                              "measurements of another recording")
+    if detected and hill is not None and params.jump.touchdown is None:
+        best = _likeliest(best, hill, frame)
+    if best.result.failure:
+        raise EstimationError(best.result.failure)
+    if model.step_at is not None:
+        offset, sd = (values[0] for values in best.result.states["gnss_step"])
+        return best._replace(result=replace(best.result,
+                                            gnss_step=GnssStep(model.step_at, offset, sd)))
+    return best
+
+
+def _readings(given, model, frame):
+    """Readings of records.READING, under the model."""
+    logs: dict[str, Log | None] = {"velocity": given.velocity, "mag": given.mag}
+    if given.fix is not None and given.fix.usable.any():
+        fix = given.fix[given.fix.usable]
+        moved = fix.stamp >= (np.inf if model.step_at is None else model.step_at)
+        logs |= {"fix": fix[~moved], "moved_fix": fix[moved]} if moved.any() else {"fix": fix}
+    readings = prepare_readings(logs, frame, model.params)
+    for name, factor in model.noise.items():
+        readings["whiten"][readings["kind"] == KINDS[name]] /= factor
+    return readings
+
+
+def _likeliest(first, hill, frame):
+    """The attempt with the likeliest touch-down."""
+    problem, attempts = first.problem, [first]
+    quat = first.result.samples["quat_world_imu"][0]
+
+    def smooth(events):
+        found = _from_attitude(problem, frame, hill, quat, events)
+        if found is None:
+            return None
+        attempts.append(found)
+        return found.result
+
+    chosen = likeliest(first.result, hill, problem.imu.log, problem.params, smooth)
+    return next(a for a in attempts if a.result is chosen)
+
+
+def _from_attitude(problem, frame, hill, quat, events):
+    """From one first attitude; None where it diverges."""
+    def refine(problem: Problem, events: JumpEvents) -> JumpEvents:
+        return events if hill is None else refine_jump(hill, _positions(problem), problem.imu.log,
+                                                       events)
+
+    own = problem.from_attitude(quat)
+    solution = solve(own, events if hill is not None else None, refine)
+    return Attempt(own, _result(own, frame, hill, solution)) if np.isfinite(own.x).all() else None
+
+
+def _positions(problem: Problem) -> np.ndarray:
+    samples = np.empty(len(problem.x), SAMPLE)
+    samples["stamp"] = problem.imu.log.stamp
+    samples["position_world"] = problem.surface_points()
+    return samples
+
+
+def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: Solution
+            ) -> SmootherResult:
+    samples = smoothed_samples(problem, solution.last)
+    states = smoothed_states(problem, solution.last)
+    innovations, residuals = {}, {}
+    for kind, measurement in enumerate(MEASUREMENTS):
+        of_kind = problem.readings["kind"] == kind
+        if np.any(of_kind):
+            width = len(measurement.components)
+            fit = problem.fit[of_kind]
+            innovations[measurement.name] = (problem.readings["stamp"][of_kind],
+                                             fit["innovation"][:, :width])
+            residuals[measurement.name] = fit["residual"][:, :width]
+    wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
+    widen(samples, wander)
+    fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
+    jump, failure = None, ""
+    if hill is not None and solution.events is not None:
+        try:
+            jump = jump_result(hill, at_surface(samples, states, problem.params),
+                               problem.imu.log, solution.events, misfit_at_landing(fits))
+        except EstimationError as error:
+            failure = str(error)
+    return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
+                          solution.steps, solution.converged, solution.events, jump, fits,
+                          residuals=residuals, wander=wander, failure=failure,
+                          log_likelihood=log_density(problem.readings)
+                          - solution.last.surprise)

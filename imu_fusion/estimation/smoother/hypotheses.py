@@ -1,0 +1,133 @@
+"""What else may be true of a recording whose readings contradict the model, and the evidence.
+
+Only where innovations wander or are larger than stated, and nothing else explains it: each
+hypothesis is smoothed, and kept if the readings are a thousand times as likely under it. Then the
+noise is fitted.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from imu_fusion.errors import EstimationError
+from imu_fusion.estimation.smoother.attempt import Attempt, Model
+from imu_fusion.estimation.smoother.gnss_step import find_steps
+from imu_fusion.estimation.smoother.measurements.registry import KINDS
+from imu_fusion.estimation.smoother.noise_fit import fit_noise
+from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, is_many
+from imu_fusion.estimation.smoother.result import SmootherResult
+
+_GAIN = 7.0          # of the log-likelihood: odds of a thousand
+_LEFT = 0.5          # of how much fixes wander, that a step of them may leave
+_LARGE = 1.5         # standard deviations, of typical innovations of the receiver
+
+_WHITE = 0.3         # of the stated noise that is left white where the rest wanders
+
+
+def fits(result: SmootherResult) -> bool:
+    """Whether innovations of the receiver are white and no larger than they should be. Smaller
+    ones are no reason: what is stated then is too cautious, and not wrong. A magnetometer's are
+    none: iron is no noise."""
+    return (all(excess == 1.0 for name, excess in result.wander.items() if name != "mag")
+            and all(size < _LARGE for name, size in result.misfit().items() if name != "mag"))
+
+
+def other_cause(result: SmootherResult) -> bool:
+    """Whether something else is wrong: a surface that the trajectory stands off, or readings in a
+    row beside it. To fit the noise to them would hide it."""
+    return (any(fit.excess > MOST_EXCESS for fit in result.surface.values())
+            or any(is_many(outliers) for outliers in result.outliers().values()))
+
+
+def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -> SmootherResult:
+    """The result of the likeliest model.
+
+    Args:
+        found: under ``model``. smooth: a model -> its Attempt.
+    """
+    # Where fixes scatter more than stated, chance makes larger steps, and gains.
+    scatter = max(1.0, found.result.misfit().get("fix", 1.0))
+    for other in _steps(found.result, model, scatter):
+        tried = smooth(other)
+        if _gain(tried, found) > _GAIN * scatter ** 2 and _left(tried.result) <= max(
+                1.0, _LEFT * _left(found.result)):
+            found, model = tried, other
+            break
+    if (model.params.maximum_likelihood == "off" or fits(found.result)
+            or other_cause(found.result)):
+        return found.result
+    given = model.params.to_mapping()
+    for alternatives in (_delays, _velocity_delays, _wandering_velocities, _wandering_fixes,
+                         _walks):
+        for other in alternatives(found, model):
+            found, model = _try(found, model, other, smooth)
+    found, model = _try(found, model, fit_noise(found.problem, model), smooth)
+    return replace(found.result, noise=dict(model.noise), adapted={
+        name: value for name, value in model.params.to_mapping().items()
+        if value != given[name]})
+
+
+def _delays(found, model):
+    return _where_zero(model, {"gnss.time_offset_sd": 0.2})
+
+
+def _velocity_delays(found, model):
+    return _where_zero(model, {"gnss.velocity_time_offset_sd": 0.2})
+
+
+def _walks(found, model):
+    return _where_zero(model, {"sensor.gyro_bias_walk": 1e-4, "sensor.acc_bias_walk": 3e-3})
+
+
+def _wandering_velocities(found, model):
+    return _wandering(found, model, "velocity", "gnss.velocity_error_sd", (1.0,))
+
+
+def _wandering_fixes(found, model):
+    return _wandering(found, model, "fix", "gnss.position_error_sd", (1.0, 3.0))
+
+
+def _wandering(found, model, name, parameter, factors):
+    """Most of what is stated of readings, or some times as much, as an error that wanders."""
+    readings = found.problem.readings
+    of_kind = readings[readings["kind"] == KINDS[name]]
+    if not len(of_kind):
+        return
+    root = np.linalg.inv(of_kind["whiten"])
+    sd = np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
+    for factor in factors:
+        for other in _where_zero(model, {parameter: tuple((factor * sd).tolist())}):
+            yield other._replace(noise={**model.noise, name: _WHITE})
+
+
+def _where_zero(model, changes):
+    """The model with other values of parameters, unless they were set."""
+    if not any(np.any(model.params.get(name)) for name in changes):
+        yield model.changed(changes)
+
+
+def _try(found, model, other, smooth):
+    """The other model and its attempt if it is so much likelier, else those found."""
+    try:
+        tried = smooth(other)
+    except EstimationError:
+        return found, model
+    return (tried, other) if _gain(tried, found) > _GAIN else (found, model)
+
+
+def _steps(result: SmootherResult, model: Model, scatter: float) -> Iterator[Model]:
+    """Models with a step of the fixes, where there seems to be one."""
+    if "fix" in result.residuals:
+        for at in find_steps(result.innovations["fix"][0], result.residuals["fix"] / scatter,
+                             result.wander["fix"] == 1.0):
+            yield model._replace(step_at=at)
+
+
+def _gain(tried: Attempt, found: Attempt) -> float:
+    return tried.result.log_likelihood - found.result.log_likelihood
+
+
+def _left(result: SmootherResult) -> float:
+    """How much fixes wander: all the time, where it is no step."""
+    return max(result.wander.get(name, 1.0) for name in ("fix", "moved_fix"))

@@ -1,0 +1,159 @@
+"""What makes a smoothed result doubtful, in words: what was seen, and what may mend it."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
+
+if TYPE_CHECKING:
+    from imu_fusion.estimation.smoother.result import Outliers, SmootherResult
+
+_MISFIT = 3.0
+# RMS of a single pass. Simulated jumps: 1.0 to 1.1 where the attitude is within 1 deg of the truth,
+# 1.7 where it is 6 deg off.
+_SINGLE_PASS = 1.3
+MOST_EXCESS = 1.5            # of the deviation from a surface; see smoother_surface_fit
+# Simulated jumps, sunk by 0.3 m: up to 1.4; by 0.7 m, or a fall of 0.4 m: from 2.5.
+_FIRST_EXCESS = 2.0
+_LEAP_SECONDS = 18.0         # s, GPS time ahead of UTC since 2017
+_SILENT = 0.01               # share of the samples
+_OUTLYING = 0.05             # share of the readings
+_RUN = 10                    # outliers in a row: single ones are what the loss is for
+_BESIDE = 5.0                # standard deviations of the median innovation of fixes
+_MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
+_WANDERS = {
+    "fix": "of the receiver: gnss.position_error_sd; a change of datum or antenna",
+    "velocity": "of the receiver: gnss.velocity_error_sd",
+    "mag": "of the field: iron nearby, sensor.mag_bias_sd"}
+_ADVICE = {m.name: m.advice for m in MEASUREMENTS}
+
+
+def remarks_on(result: "SmootherResult") -> Iterator[str]:
+    """Texts on what a user should know before trusting a SmootherResult."""
+    if result.converged is False:
+        yield (f"the smoother did not converge in {result.iterations} iterations: take its "
+               "result as provisional")
+    yield from _on_stamps(result)
+    yield from _on_step(result)
+    yield from _on_single_pass(result)
+    yield from _on_adapted(result)
+    yield from _on_misfits(result)
+    yield from _on_outliers(result)
+    yield from _on_wander(result)
+    yield from _on_place(result)
+    yield from _on_surface(result)
+
+
+def _on_stamps(result):
+    lag = result.gnss_lag
+    if lag:
+        leap = ": GPS time that was not turned into UTC" if abs(
+            abs(lag) - _LEAP_SECONDS) < 0.5 else ""
+        yield (f"the stamps of fixes and velocities are {abs(lag):.1f} s "
+               f"{'late' if lag > 0 else 'early'} against those of the Imu, as turns and forces "
+               f"tell{leap}; they were taken so much {'earlier' if lag > 0 else 'later'}. Correct "
+               "the recording, or see that both clocks are one")
+
+
+def _on_step(result):
+    step = result.gnss_step
+    if step is not None:
+        when = (step.stamp - int(result.samples["stamp"][0])) * 1e-9
+        yield (f"from {when:.1f} s after the first Imu sample on the fixes lie "
+               + "/".join(f"{o:+.1f}" for o in step.offset) + " m (east/north/up) of those "
+               "before, a step that the Imu did not feel: another height datum, antenna or base. "
+               "Positions are those of the fixes before it; if the later ones are right, all "
+               "positions are off by as much")
+
+
+def _on_single_pass(result):
+    """A single pass: no iteration mends a wrong first attitude. By the RMS, as what that costs the
+    first seconds is lost in a median."""
+    if result.converged is not None:
+        return
+    rms = {name: float(np.sqrt(np.mean(values ** 2)))
+           for name, (_, values) in result.innovations.items() if len(values)}
+    name = max(rms, key=lambda name: rms[name], default=None)
+    if name and rms[name] > _SINGLE_PASS:
+        yield (f"the {name} innovations of the single pass have an RMS of {rms[name]:.1f} standard "
+               "deviations: it may have begun with a wrong attitude and kept to it, or the noise "
+               "is another; method: iterated starts from several and repeats")
+
+
+def _on_adapted(result):
+    if result.adapted or result.noise:
+        taken = [f"{name}: {_short(value)}" for name, value in result.adapted.items()]
+        taken += [f"{factor:.2g} times the stated standard deviations of {name}"
+                  for name, factor in result.noise.items()]
+        yield ("with the noise as given the innovations wander or are larger than stated; "
+               "far likelier, and taken, is " + ", ".join(taken) + ". Put it into the parameters "
+               "to keep it (maximum_likelihood: off keeps those given)")
+
+
+def _short(value):
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _on_misfits(result):
+    for name, size in result.misfit().items():
+        if size > _MISFIT:
+            yield (f"the {name} innovations are {size:.1f} times as large as their standard "
+                   f"deviations: {_ADVICE[name]}")
+
+
+def is_many(outliers: "Outliers") -> bool:
+    """Whether Outliers are more than the single ones that the loss is for."""
+    return outliers.share > _OUTLYING or outliers.longest >= _RUN
+
+
+def _on_outliers(result):
+    for name, outliers in result.outliers().items():
+        if is_many(outliers):
+            yield (f"{100 * outliers.share:.0f} % of the {name} readings lie far beside the "
+                   "trajectory and hardly count, up to "
+                   f"{outliers.longest} in a row ({outliers.duration:.1f} s): {_ADVICE[name]}")
+
+
+def _on_wander(result):
+    for name, excess in result.wander.items():
+        if excess > 1.0:
+            yield (f"the {name} innovations wander: their means over seconds are {excess:.1f} "
+                   "times as large as white noise leaves them: a step or slow errors "
+                   f"({_WANDERS.get(name, 'sensor noise')}), or noise and bias walks of the Imu "
+                   "that are too small (sensor.gyro_noise_density, sensor.acc_noise_density, "
+                   "sensor.gyro_bias_walk, sensor.acc_bias_walk); the standard deviations of "
+                   f"{'headings' if name == 'mag' else 'all'} are as much larger")
+
+
+def _on_place(result):
+    """Medians of the normalised innovations of fixes that cannot be chance where a surface holds
+    the trajectory."""
+    if not result.surface or "fix" not in result.innovations:
+        return
+    values = result.innovations["fix"][1]
+    middle = np.median(values, axis=0)
+    if np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values)):
+        yield ("the fixes lie beside the trajectory that the surface holds, by "
+               + "/".join(f"{b:+.1f}" for b in middle) + " (east/north/up) of their standard "
+               "deviations: the origin of the surface may be off, the sensor ride above it "
+               "(surface.body_height) or the fixes wander (gnss.position_error_sd)")
+
+
+def _on_surface(result):
+    for name, fit in result.surface.items():
+        if fit.silent > _SILENT:
+            yield (f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of the samples "
+                   "that it should hold: its grid may end there")
+        if fit.first_excess > _FIRST_EXCESS and fit.excess <= MOST_EXCESS and result.jump:
+            yield (f"in the first second the trajectory stands off the surface ({name}) by "
+                   f"{fit.first_excess:.1f} times as much as its sigma of {fit.sigma:g} m allows: "
+                   "a fall, a deep landing or another touch-down; standard deviations of the "
+                   "landing are as much larger (jump.event_margin, jump.touchdown)")
+        if fit.excess > MOST_EXCESS:
+            yield (f"the trajectory stands off the surface ({name}) by {fit.rms:.2f} m (RMS; "
+                   f"largest {fit.largest:.2f} m), over seconds {fit.excess:.1f} times as much as "
+                   f"its sigma of {fit.sigma:g} m allows: the surface may be another than the one "
+                   "given, or the sensor move against it (a larger sigma or surface.interval, "
+                   "surface.body_height_sd)")
