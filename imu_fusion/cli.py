@@ -339,6 +339,36 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
         sys.exit(INCOMPLETE)
 
 
+@cli.group()
+def calibrate() -> None:
+    """Calibrate a sensor from a recording, as a parameter file."""
+
+
+@calibrate.command("magnetometer")
+@click.argument("bag", type=click.Path())
+@click.option("--topic", default="imu/mag", show_default=True, help="Its topic in BAG.")
+@click.option("--out", type=click.Path(), help="Parameter file to write.")
+def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
+    """Hard and soft iron from BAG, in which the sensor turned about all axes.
+
+    Prints how well it is determined, and sensor.mag_offset and sensor.mag_matrix as the
+    orientation estimator and the smoother take them.
+    """
+    from imu_fusion import calibrate as calibration
+    found, remarks = calibration.calibrate_recorded_magnetometer(bag, topic)
+    table = Table("magnetometer", "")
+    for name, value in calibration.magnetometer_report(found):
+        table.add_row(name, value)
+    console.print(table)
+    for remark in remarks:
+        click.echo(f"warning: {remark}", err=True)
+    text = calibration.magnetometer_parameters(found, bag)
+    if out is None:
+        click.echo(text)
+    else:
+        Path(out).write_text(text)
+
+
 @cli.command(cls=_ListingCommand, listing=("Demos", DEMOS))
 @click.argument("name", default="orientation")
 @click.option("--out", type=click.Path(), default="demo_out", show_default=True,

@@ -52,10 +52,12 @@ ARROWS = {
     "report": ("errors", "kernels", "parameters", "geometry", "samples", "surfaces",
                "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
                "evaluation", "messages", "recordings", "streams", "batch"),
+    "calibrate": ("errors", "geometry", "recordings", "sensors"),
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
               "batch", "report"),
     "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",
-            "compile_ahead", "nodes", "batch", "report", "demos", "signals"),
+            "compile_ahead", "nodes", "batch", "report", "calibrate", "demos",
+            "signals"),
 }
 # Arrows of one file, with the reason.
 ARROWS_OF_FILES = {

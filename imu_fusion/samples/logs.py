@@ -89,11 +89,16 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class ImuLog(Log):
-    """Gyroscope ``gyr`` (n, 3) rad/s and specific force ``acc`` (n, 3) m/s^2."""
+    """Gyroscope ``gyr`` (n, 3) rad/s and specific force ``acc`` (n, 3) m/s^2.
+
+    ``gyr_sd`` (n, 3) rad/s: standard deviation of rates that were recovered, as white noise that
+    does as much; zero where a rate was measured. None: all were.
+    """
 
     gyr: np.ndarray = _column((3,))
     acc: np.ndarray = _column((3,))
     frame_id: str = "imu_link"
+    gyr_sd: np.ndarray | None = _column((3,))
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,6 +38,7 @@ _SPIN_TIME = 0.35        # s, in which snow takes the spin along
 _AXLE_RATE = 1.0         # rad/s, at which a rolling ball's axle turns into the horizontal
 _DAMPING = 0.3           # of the contact, relative to critical
 _ROLL = 15.5             # s, when the ball leaves the flow
+_LETTING_GO = 0.05       # s, in which the flow does so
 _END = 70.0              # s, when it has about stopped
 
 # Columns: time (s), speed (m/s) of what drags the ball, and how fast it does (1/s), spin (rad/s)
@@ -49,7 +50,7 @@ _SCHEDULE = np.array([
     [3.6, 13.5, 1.0, 1.5, 0.0],
     [9.0, 11.5, 1.0, 1.5, 0.0],
     [_ROLL, 9.5, 1.0, 1.5, 0.0],
-    [_ROLL + 0.05, 10.5, 1.5, 0.0, 1.0],
+    [_ROLL + _LETTING_GO, 10.5, 1.5, 0.0, 1.0],
     [20.0, 10.5, 1.5, 0.0, 1.0],
     [25.0, 8.5, 1.5, 0.0, 1.0],
     [30.0, 4.5, 1.5, 0.0, 1.0],
@@ -342,7 +343,8 @@ class Avalanche:
             np.linalg.norm(moving[:, 6:9], axis=1) < 0.02)
         stop = len(still) - int(np.argmin(still[::-1]))
         return (Phase(0, -np.inf), Phase(1, 0.0), Phase(2, float(at[flight])),
-                Phase(3, float(at[impact])), Phase(4, float(at[over])), Phase(5, _ROLL),
+                Phase(3, float(at[impact])), Phase(4, float(at[over])),
+                Phase(5, _ROLL + 0.5 * _LETTING_GO),
                 Phase(6, float(at[stop])))
 
     def elevation(self, east: ArrayLike, north: ArrayLike) -> np.ndarray:

@@ -14,6 +14,8 @@ import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError, MessageError, ParameterError
+from imu_fusion.estimation.orientation.params import OrientationParams
+from imu_fusion.estimation.orientation.recovered import recover
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.estimation.smoother.result import SmootherResult
@@ -92,6 +94,10 @@ class SmoothingParams(SmootherParams):
     OLD_NAMES: ClassVar[Mapping[str, str]] = {**SmootherParams.OLD_NAMES,
                                               "surface": "surface.file"}
 
+    recover_rates: bool = param(
+        False, doc="First recover rates beyond the gyroscope's range from the magnetometer, as the "
+        "orientation estimator does on a whole recording, and take them with their covariance. "
+        "Set it for a body that tumbles beyond the range.")
     surface: SurfaceFile = SurfaceFile()
     frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
@@ -248,8 +254,20 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     surface = load_surface(params.surface.file) if params.surface.file else None
-    return Smoother(params, surface).run(logs[IMU_TOPIC], logs.get(MAG_TOPIC),
-                                         logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
+    imu, mag = logs[IMU_TOPIC], logs.get(MAG_TOPIC)
+    if params.recover_rates:
+        imu = recover(imu, mag, recovery_params(params))
+        params = params.replace(**{"sensor.gyro_range": None})
+    return Smoother(params, surface).run(imu, mag, logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
+
+
+def recovery_params(params: SmootherParams) -> OrientationParams:
+    """Parameters of the orientation estimator that recovers rates for the smoother: its sensor, and
+    a body in free fall and under blows, whose force says nothing of gravity."""
+    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_range", "mag_offset", "mag_matrix")
+    return OrientationParams().replace(**{
+        "fusion.use_acc": False,
+        **{f"sensor.{name}": getattr(params.sensor, name) for name in shared}})
 
 
 @dataclass(frozen=True)

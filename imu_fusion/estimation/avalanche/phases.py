@@ -28,8 +28,8 @@ class PhaseParams(Parameters):
         0.3, unit="s", low=0.02, doc="Shortest flight that is the throw of phase 2; without one "
         "the entrainment goes over into the steady flow.")
     rolling_rate: float = param(
-        8.0, unit="rad/s", low=0.5, doc="Mean rate about the contour line above which the ball "
-        "rolls. Lower it for large snowballs.")
+        8.0, unit="rad/s", low=0.5, doc="Mean rate above which the ball rolls. Lower it for large "
+        "snowballs.")
     rolling_time: float = param(
         2.0, unit="s", low=0.1, doc="Time over which that mean is taken.")
 
@@ -66,20 +66,19 @@ def flights(time: np.ndarray, force: np.ndarray, gravity: float,
     return [f for f in found if f.end - f.start >= params.flight_time]
 
 
-def find_phases(time: np.ndarray, force: np.ndarray, rate_lateral: np.ndarray, stop: float,
+def find_phases(time: np.ndarray, force: np.ndarray, rate: np.ndarray, stop: float,
                 gravity: float, params: PhaseParams = PhaseParams()) -> list[Transition]:
     """The transitions, in order; those that the motion does not have are left out.
 
     Args:
         time: (n,) s, from the entrainment (0) on. force: as :func:`flights` has it.
-        rate_lateral: (n,) rad/s about the contour line, recovered; a ball that rolls down has a
-            positive one.
+        rate: (n, 3) rad/s, recovered.
         stop: s, when the ball comes to rest. gravity: m/s^2.
     """
     found = [Transition(1, 0.0, "rates and forces leave the level of the rest before")]
     long = [f for f in flights(time, force, gravity, params)
             if f.end - f.start >= params.first_flight_time]
-    rolls = _rolling(time, rate_lateral, params)
+    rolls = _rolling(time, np.linalg.norm(rate, axis=1), params)
     if long and (rolls is None or long[0].start < rolls):
         flight = long[0]
         found += [
@@ -94,21 +93,20 @@ def find_phases(time: np.ndarray, force: np.ndarray, rate_lateral: np.ndarray, s
             found.append(Transition(4, float(time[over]), f"after a peak of "
                                     f"{size[peak] / gravity:.1f} g the force is down to 1 g"))
     if rolls is not None:
-        found.append(Transition(5, rolls, f"the rate about the contour line rises to more than "
-                                f"{params.rolling_rate:g} rad/s for {params.rolling_time:g} s"))
+        found.append(Transition(5, rolls, f"the rate rises to more than {params.rolling_rate:g} "
+                                f"rad/s and stays there"))
     found.append(Transition(6, stop, "rates and forces are down at the level of rest"))
     return found
 
 
 def _rolling(time, rate, params):
-    """Time (s) at which the rate about the contour line begins to rise to that of rolling: where
-    the line through a fifth and a half of the rise meets the level before. None where the mean
-    rate never is that of rolling."""
+    """Time (s) at which the rate (n,) begins to rise to that of rolling, of the longest time that
+    its mean is that of rolling; None where it never is."""
     step = float(np.median(np.diff(time)))
     width = max(int(round(params.rolling_time / step)), 1)
     if len(rate) <= 2 * width:
         return None
-    # Mean over the time that follows each sample; the throw spins a ball, too, but not for long.
+    # Mean over the time that follows each sample; the throw spins a ball, too, but not as long.
     sums = np.concatenate([[0.0], np.cumsum(rate)])
     mean = (sums[width:] - sums[:-width]) / width
     fast = np.concatenate([[False], mean > params.rolling_rate, [False]])

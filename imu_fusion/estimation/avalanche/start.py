@@ -19,7 +19,7 @@ _SHORTEST = 0.5      # s, of a rest
 # the sensors of the paper passes, and less than a body in motion shows.
 _QUIET_RATE = 0.15   # rad/s
 _QUIET_FORCE = 3.0   # m/s^2
-# The motion has begun where three samples deviate from the rest by more than this.
+# The ball moves where the mean of a few samples deviates from the rest by more than this.
 _ONSET_SDS = 5.0
 _ONSET_FORCE = 0.15  # m/s^2, and at least by that
 _ONSET_RATE = 0.02   # rad/s
@@ -67,19 +67,26 @@ def find_motion(imu: ImuLog) -> MotionSpan:
     which = int(np.argmax([violence[e] - violence[b] for b, e in zip(begins, ends)]))
     if begins[which] >= len(imu):
         raise EstimationError("nothing but rest in the recording: where is the motion?")
-    return _refined(imu, rests[which][0], begins[which], ends[which], width)
-
-
-def _refined(imu, rest_start, quiet_until, stop, width):
-    """MotionSpan, its start where samples leave the level of the rest before."""
+    rest_start, quiet_until, stop = rests[which][0], begins[which], ends[which]
     level = slice(max(rest_start, quiet_until - 10 * width), quiet_until)
-    start = len(imu)
-    means = []
+    away = _away(imu, level, slice(quiet_until, stop), 3)
+    start = quiet_until + int(np.argmax(away)) if away.any() else stop
+    if which + 1 < len(rests):
+        # What is quiet can still be coming to rest.
+        begin, end = rests[which + 1]
+        slow = np.flatnonzero(_away(imu, slice((begin + end) // 2, end), slice(begin, end),
+                                    width // 2))
+        stop = begin + int(slow[-1]) + 1 if len(slow) else begin
+    return MotionSpan(level.start, start, stop, imu.gyr[level].mean(axis=0),
+                      imu.acc[level].mean(axis=0))
+
+
+def _away(imu, level, part, width):
+    """Mask of the samples of a part (slice) that deviate from the mean of a rest (slice ``level``),
+    in the mean of ``width`` samples."""
+    away = np.zeros(part.stop - part.start, bool)
     for values, least in ((imu.gyr, _ONSET_RATE), (imu.acc, _ONSET_FORCE)):
         mean, sd = values[level].mean(axis=0), values[level].std(axis=0)
-        means.append(mean)
-        smooth = scipy.ndimage.uniform_filter1d(values[quiet_until:] - mean, 3, axis=0)
-        away = (np.abs(smooth) > np.maximum(_ONSET_SDS * sd / np.sqrt(3.0), least)).any(axis=1)
-        if away.any():
-            start = min(start, quiet_until + int(np.argmax(away)))
-    return MotionSpan(level.start, min(start, stop), stop, *means)
+        smooth = scipy.ndimage.uniform_filter1d(values[part] - mean, width, axis=0)
+        away |= (np.abs(smooth) > np.maximum(_ONSET_SDS * sd / np.sqrt(width), least)).any(axis=1)
+    return away

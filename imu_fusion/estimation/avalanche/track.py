@@ -16,7 +16,7 @@ from imu_fusion.estimation.avalanche.in_situ import (
 from imu_fusion.estimation.avalanche.slope import fall_line, slope_axes
 from imu_fusion.estimation.avalanche.start import MotionSpan, find_motion
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator
-from imu_fusion.estimation.orientation.gyro_limit import limits_of
+from imu_fusion.estimation.orientation.gyro_limit import ranges_of
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.logs import ImuLog, MagLog, seconds
@@ -79,10 +79,7 @@ def clipped(gyr: np.ndarray, gyro_range: float | None) -> np.ndarray:
     gyro_range: rad/s; None: found from flat tops.
     """
     if gyro_range is None:
-        limits = limits_of(gyr, kernel_parameters(OrientationParams()))["limit"][0]
-        if np.isfinite(limits).any():
-            # An axis that was there too seldom to show it has the range of the others.
-            limits = np.minimum(limits, limits[np.isfinite(limits)].max())
+        limits = ranges_of(gyr, kernel_parameters(OrientationParams()))
     else:
         limits = np.full(3, gyro_range)
     # Behind a calibration what was clipped is no longer flat.

@@ -43,6 +43,13 @@ def _find_all(found, par, gyr):
     mark_flat_tops(found, ranges, _FLOOR, False, gyr)
 
 
+def ranges_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:
+    """Limits (3,) rad/s as :func:`limits_of` finds them, infinite where no axis has one; an axis
+    that was at its limit too seldom to show it has the range of the others."""
+    limits = limits_of(gyr, par)["limit"][0]
+    return np.minimum(limits, limits[np.isfinite(limits)].max(initial=0.0) or np.inf)
+
+
 def limits_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:
     """What rates (n, 3) rad/s show of the gyroscope's limits, (1,) FLAT_TOPS: its ``limit`` is
     given, found or infinite.

@@ -2,7 +2,7 @@
 clipped readings flagged."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -102,6 +102,9 @@ def prepare_imu(imu: ImuLog, params: SmootherParams) -> ImuInput:
         clipped.append(lost & recorded[:, None])
         either = lost[1:] | lost[:-1]
         noise.append(np.where(either, unknown, density) ** 2)
+    if imu.gyr_sd is not None:
+        sd = np.maximum(imu.gyr_sd[1:], imu.gyr_sd[:-1])
+        noise[0] = np.maximum(noise[0], sd ** 2 * np.diff(imu.stamp)[:, None] * 1e-9)
     return ImuInput(imu, recorded, np.concatenate(clipped, axis=1), np.concatenate(noise, axis=1))
 
 
@@ -120,6 +123,10 @@ def _bridged(imu: ImuLog, longest: float) -> tuple[ImuLog, np.ndarray]:
     order = np.argsort(stamp, kind="stable")
     recorded = np.concatenate([recorded, np.zeros(len(added), bool)])[order]
     since = stamp[order] - imu.stamp[0]
-    gyr, acc = (np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v[:, i])
-                                 for i in range(3)]) for v in (imu.gyr, imu.acc))
-    return ImuLog(stamp=stamp[order], gyr=gyr, acc=acc, frame_id=imu.frame_id), recorded
+
+    def bridged(values: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.interp(since, imu.stamp - imu.stamp[0], v) for v in values.T])
+
+    sd = None if imu.gyr_sd is None else bridged(imu.gyr_sd)
+    return replace(imu, stamp=stamp[order], gyr=bridged(imu.gyr), acc=bridged(imu.acc),
+                   gyr_sd=sd), recorded

@@ -46,6 +46,9 @@ class Sensor(Parameters):
     mag_noise_sd: float = sensor(
         "mag_noise_sd", 5e-6, "Raise it beside motors: an error that n samples in a row repeat "
         "counts as sqrt(n) times as large.")
+    mag_offset: tuple[float, ...] = sensor("mag_offset", (0.0, 0.0, 0.0))
+    mag_matrix: tuple[float, ...] = sensor(
+        "mag_matrix", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
     mag_bias_sd: float = sensor("mag_bias_sd", 5e-6)
     mag_scale_sd: float = sensor("mag_scale_sd", 0.1)
 
@@ -198,7 +201,8 @@ class Iteration(Parameters):
 _NOT_IN_THE_PAPER = (
     "maximum_likelihood",
     "sensor.gyro_bias_sd", "sensor.gyro_bias_walk", "sensor.gyro_scale_sd", "sensor.acc_bias_sd",
-    "sensor.acc_bias_walk", "sensor.acc_matrix_sd", "sensor.mag_noise_sd", "sensor.mag_bias_sd",
+    "sensor.acc_bias_walk", "sensor.acc_matrix_sd", "sensor.mag_noise_sd", "sensor.mag_offset",
+    "sensor.mag_matrix", "sensor.mag_bias_sd",
     "sensor.mag_scale_sd", "gnss.fix_sd", "gnss.velocity_sd", "gnss.covariances", "gnss.loss",
     "gnss.loss_scale", "gnss.position_error_sd", "gnss.position_error_tau",
     "gnss.velocity_error_sd", "gnss.velocity_error_tau", "gnss.time_offset_sd",

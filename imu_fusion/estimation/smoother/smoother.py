@@ -50,6 +50,7 @@ class Smoother:
         if self.params.method == "extended_rts":
             return ExtendedRts(self.params, self.surface).run(imu, mag, fix, velocity, events,
                                                               initial_quat)
+        mag = _calibrated(mag, self.params)
         given, model = Given(imu, mag, fix, velocity, events, initial_quat), Model(self.params)
         found, lag = self._smooth_and_time(given, model)
         if found is None or lag:
@@ -79,3 +80,11 @@ class Smoother:
                 raise
             return None, lag
         return found, find_lag(found.result.samples, given.velocity)
+
+
+def _calibrated(mag, params):
+    """The field as sensor.mag_offset and mag_matrix make it of a MagLog or None."""
+    if mag is None:
+        return None
+    matrix = np.reshape(params.sensor.mag_matrix, (3, 3))
+    return replace(mag, mag=(mag.mag - params.sensor.mag_offset) @ matrix.T)

@@ -61,6 +61,8 @@ CHANGED = {
     "jump.touchdown": (5.0, {}),
     "jump.event_margin": (0.1, {}),
     "initial.attitude_sd": (0.1, {}),
+    "sensor.mag_offset": ((1e-6, 2e-6, 0.0), {}),
+    "sensor.mag_matrix": ((1.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), {}),
     "initial.position": ((47.4, 10.28, 900.0), {}),
     "initial.position_sd": (2.0, {}),
     "initial.speed_sd": (1.0, {}),
