@@ -10,6 +10,8 @@ between stamps it changes linearly. VQF applies the rate of a stamp to the whole
 there, so that its estimates are those of half a step later; they are moved back by that, along the
 rotation between two of them.
 
+**References** that jump (markers mixed up) do not count near the jump.
+
 **Frames.** Where a reference has frames of its own, one turn of its world and one of its body are
 fitted per recording and estimator, over all rows (``fit_frames``).
 """
@@ -31,7 +33,9 @@ from imu_fusion.samples.logs import ImuLog, MagLog
 # chi2 with 3 degrees of freedom, the probability of 3 sigma of a normal variate.
 _THREE_SIGMA = 14.156
 WORSE = 1.25
+_FEW = 0.9               # share within 3 sigma below which a recording is named
 _CUT = 1500              # samples after motion begins
+_JUMP = 0.25             # s, about a jump of a reference within which it does not count
 _TURN_ROWS = 20          # over which turns show how a body is mounted
 _FIT_ROUNDS = 100
 _FAST = ("06", "08", "21", "28")
@@ -109,9 +113,25 @@ def _npz(folder, pattern="*.npz"):
             mag = MagLog(stamp, d["mag"] * 1e-6)
         elif "mag_n" in d:
             mag = MagLog(np.round(d["mag_t"] * 1e9).astype(np.int64), d["mag_n"] * 1e-6)
+        quat = d["quat"].astype(float)[:, [1, 2, 3, 0]]
+        imu = ImuLog(stamp, d["gyr"], d["acc"])
         frames = "yaw" if d["align"] == "yaw" else "level" if d["vertical"] else "full"
-        yield Recording(f"{folder} {path.stem}", ImuLog(stamp, d["gyr"], d["acc"]), mag,
-                        d["quat"].astype(float)[:, [1, 2, 3, 0]], d["mov"].astype(bool), frames)
+        mask = d["mov"].astype(bool) & ~_near_jumps(imu, quat)
+        yield Recording(f"{folder} {path.stem}", imu, mag, quat, mask, frames)
+
+
+def _near_jumps(imu, reference):
+    """Mask (n,) of rows near a step over which the reference turns more than twice as fast as the
+    gyroscope ever does: markers that were mixed up."""
+    known = np.flatnonzero(np.isfinite(reference).all(axis=1))
+    turn = Rotation.from_quat(reference[known])
+    stamp = imu.stamp[known]
+    rate = (turn[:-1].inv() * turn[1:]).magnitude() / (np.diff(stamp) * 1e-9)
+    jumps = stamp[:-1][rate > 2.0 * np.linalg.norm(imu.gyr, axis=1).max()]
+    near = np.zeros(len(imu), dtype=bool)
+    for jump in jumps:
+        near |= np.abs(imu.stamp - jump) < _JUMP * 1e9
+    return near
 
 
 SETS = {
@@ -213,15 +233,18 @@ def ours(r, mode, changes=None):
     return rows["quat_world_imu"], rows["cov_attitude"]
 
 
-def score_all(r, changes=None):
-    """Scores of one recording by estimator's name."""
-    return {"VQF": score(r, _peer(r, False)), "OfflineVQF": score(r, _peer(r, True)),
-            "causal": score(r, *ours(r, "causal", changes)),
-            "smoothed": score(r, *ours(r, "smoothed", changes))}
+def peers(r):
+    """Scores of one recording by peer's name."""
+    return {"VQF": score(r, _peer(r, False)), "OfflineVQF": score(r, _peer(r, True))}
+
+
+def score_ours(r, changes=None):
+    """Our scores of one recording by mode."""
+    return {mode: score(r, *ours(r, mode, changes)) for mode in ("causal", "smoothed")}
 
 
 def summary(name, scores):
-    """Cells of a set's two lines, causal and smoothed: scores a list of score_all's."""
+    """Cells of a set's two lines, causal and smoothed: scores a list of dicts by estimator's name."""
     for mode, peer in (("causal", "VQF"), ("smoothed", "OfflineVQF")):
         mine, other = [s[mode] for s in scores], [s[peer] for s in scores]
         means = [" / ".join(f"{np.mean([getattr(s, part) for s in group]):.2f}"
@@ -244,6 +267,16 @@ def trial_line(name, scores):
         for k, s in scores.items())
 
 
+def worst(name, scores):
+    """Rows of a recording's modes that are worse than the peer, or than they say, by much."""
+    for mode, peer in (("causal", "VQF"), ("smoothed", "OfflineVQF")):
+        mine, other = scores[mode], scores[peer]
+        if mine.total > WORSE * other.total or mine.within < _FEW:
+            yield [name, mode, f"{other.total:.2f}",
+                   f"{mine.total:.2f} / {mine.inclination:.2f} / {mine.heading:.2f}",
+                   f"{mine.within:.2f}"]
+
+
 HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "ours",
           "ours / peer", "within 3 sigma", "stated / actual, inclination", "heading",
           "trials > 25 % worse"]
@@ -252,19 +285,24 @@ HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "
 def main(arguments):
     quick, trials = "--quick" in arguments, "--trials" in arguments
     chosen = [a for a in arguments if not a.startswith("--")] or list(SETS)
-    rows = []
+    rows, named = [], []
     for name in chosen:
         recordings = list(SETS[name]())[:2 if quick else None]
         scores = []
         for r in recordings:
-            scores.append(score_all(r))
+            scores.append(peers(r) | score_ours(r))
+            named += worst(r.name, scores[-1])
             if trials:
                 print(trial_line(r.name, scores[-1]), flush=True)
         rows += summary(name, scores) if scores else []
     if quick or chosen != list(SETS):
-        for row in rows:
+        for row in rows + named:
             print(" | ".join(row))
         return
+    write_table("orientation_worst", ["recording", "mode", "peer, deg",
+                                      "ours: total / inclination / heading", "within 3 sigma"],
+                named, note=f"Recordings of orientation_sets that are {WORSE} times worse than the "
+                            f"peer, or with fewer than {_FEW} of the rows within 3 sigma.")
     write_table("orientation_sets", HEADER, rows,
                 note=f"Peers: VQF (causal) and OfflineVQF (smoothed) of vqf {version('vqf')}, "
                      "default parameters, as ours. RMSE over the rows that count, mean over the "

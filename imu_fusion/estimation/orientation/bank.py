@@ -25,12 +25,10 @@ from imu_fusion.geometry.rotation import (
 )
 from imu_fusion.kernels import njit
 
-# Innovations of one disturbance repeat each other: blocks of 20 ms are taken as white by the
-# filter, while what moves the innovations lasts as long as the local field does, 0.3 s. The log
-# likelihood counts them once.
-_REPEATS = 15.0
-# Before there is a sample: near iron is the exception, and a rest tells nothing of it.
-_LOG_PRIOR = math.log(0.05)    # of each hypothesis beside the first
+# Innovations repeat each other: blocks of 20 ms are taken as white by the filter, while what moves
+# the innovations lasts for seconds (the sum of their autocorrelation is 1 to 4 s on a hand, a phone
+# and a robot). The log likelihood counts what repeats within 3 s once.
+_REPEATS = 150.0
 _NEGLIGIBLE = 1e-6         # weight of a hypothesis that changes nothing any more
 _NO_TAPE = np.empty(0, es.TAPE)
 
@@ -44,35 +42,39 @@ def step(state, par, stamp, sample, row):
         stamp, sample: of fusion.step.
         row: the output row.
     """
-    if len(state) == 1 or (state[0].field_norm == 0.0 and state[0].queue.count == 0):
-        # Without a magnetometer the hypotheses are one.
+    used = len(state)
+    if state[0].field_norm == 0.0 and state[0].queue.count == 0:
+        # Without a magnetometer the hypotheses of the field are one.
+        used = par[0].gyroscopes
+    else:
+        part(state, par)
+    if used == 1:
         return fusion.step(state[0], par[0], stamp, sample, row, _NO_TAPE)
-    part(state)
-    rows = np.empty(len(state), ORIENTATION_DTYPE)
+    rows = np.empty(used, ORIENTATION_DTYPE)
     result = 0
-    for k in range(len(state)):
+    for k in range(used):
         result = fusion.step(state[k], par[k], stamp, sample, rows[k], _NO_TAPE)
     if result > 0:
-        mix(rows, weights(state), row)
+        mix(rows, weights(state, par), row)
     return result
 
 
 @njit
-def part(state):
-    """Let hypotheses go on from the first one that were one with it so far."""
-    for k in range(1, len(state)):
+def part(state, par):
+    """Let hypotheses go on from the one with the same gyroscope that they were one with so far."""
+    for k in range(par[0].gyroscopes, len(state)):
         if state[k].stamp != state[0].stamp:
-            state[k] = state[0]
+            state[k] = state[k % par[0].gyroscopes]
 
 
 @njit
-def weights(state):
+def weights(state, par):
     """Weights (k,) of the hypotheses by what was measured so far; the sum is 1, those that are
-    negligible, or still one with the first, are 0."""
+    negligible, or still one with another, are 0."""
     out = np.full(len(state), -math.inf)
     for k in range(len(state)):
-        if state[k].stamp == state[0].stamp:
-            out[k] = state[k].log_likelihood / _REPEATS + (_LOG_PRIOR if k > 0 else 0.0)
+        if state[k].started and state[k].stamp == state[0].stamp:
+            out[k] = state[k].log_likelihood / _REPEATS + par[k].log_prior
     largest = out.max()
     total = 0.0
     for k in range(len(state)):
@@ -94,7 +96,8 @@ def likeliest(weight):
 
 @njit
 def mix(rows, weight, row):
-    """Write the mixture of rows (k,) ORIENTATION_DTYPE with weights (k,) to ``row``.
+    """Write the mixture of rows (k,) ORIENTATION_DTYPE with weights (k, or more that are zero) to
+    ``row``.
 
     Attitude and numbers are means, covariances those of the mixture: the mean one and the spread
     of the means. Stamp, flags and what belongs to the sample are the likeliest row's.

@@ -275,7 +275,8 @@ def update(cov, error, states, row, tape):
         tape: (1,) TAPE of the block, or empty.
 
     Returns:
-        The measurement's log likelihood, less a constant.
+        The innovation over its standard deviation, and the measurement's log likelihood, less a
+        constant.
 
     Raises:
         IndexError: the tape is full: MAX_UPDATES is less than the measurements of a block.
@@ -301,7 +302,8 @@ def update(cov, error, states, row, tape):
         if gain != 0.0:
             for j in range(states):
                 cov[i, j] -= gain * spread[j]
-    return -0.5 * (math.log(total) + innovation * innovation / total)
+    normalised = innovation / math.sqrt(total)
+    return normalised, -0.5 * (math.log(total) + normalised * normalised)
 
 
 @njit

@@ -60,14 +60,15 @@ class OrientationEstimator:
         """
         if self._kind(params) != self._kind(self.params):
             raise ParameterError(
-                "parameters 'method', 'gyro_mag.as_printed', 'mode' and the number of values of "
-                "'fusion.local_field_sd' cannot change while running: start another estimator")
+                "parameters 'method', 'gyro_mag.as_printed', 'mode' and the numbers of values of "
+                "'fusion.local_field_sd' and 'fusion.gyro_factor' cannot change while running: "
+                "start another estimator")
         self.params, self._par = params, kernel_parameters(params)
 
     @staticmethod
     def _kind(params):
         return (params.method, params.is_as_printed, params.mode,
-                len(params.fusion.local_field_sd))
+                len(params.fusion.local_field_sd), len(params.fusion.gyro_factor))
 
     def reset(self) -> None:
         """Forget all samples: the next ones start a new alignment."""
@@ -209,7 +210,7 @@ class OrientationEstimator:
         anew, at the yaw of before if nothing tells another."""
         rows = self.finish()
         if self._alignment is not None:
-            likeliest = self._state[bank.likeliest(bank.weights(self._state))]
+            likeliest = self._state[bank.likeliest(bank.weights(self._state, self._par))]
             self._yaw = quat_to_rpy(likeliest["quat_world_imu"])[2]
         corrected = self.take_corrected()
         self._counted = self._counts()
@@ -251,9 +252,12 @@ class OrientationEstimator:
     def summary(self) -> dict[str, Any]:
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla).
 
-        Of the hypotheses it is the likelier: ``local_field_sd``, with its weight.
+        Of the hypotheses it is the likeliest: ``local_field_sd`` and ``gyro_factor``, each with
+        the weight of all that agree. ``wander_tilt`` and ``wander_heading`` are how many times more
+        than white ones its innovations wander: the attitude's standard deviations are widened by
+        what is above 1.
         """
-        weight = bank.weights(self._state)
+        weight = bank.weights(self._state, self._par)
         best = bank.likeliest(weight)
         s, par, a = self._state[best], self._par[0], self._alignment
         counts = dict(
@@ -267,12 +271,20 @@ class OrientationEstimator:
             initial_tilt_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[0, 0])),
             initial_heading_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[2, 2])),
             local_field_sd=float(self._par[best]["local_field_sd"]),
-            local_field_weight=float(weight[best]),
+            gyro_factor=float(self._par[best]["gyro_factor"]),
+            local_field_weight=self._weight_of("local_field_sd", weight, best),
+            gyro_factor_weight=self._weight_of("gyro_factor", weight, best),
+            **{f"wander_{axis}": math.sqrt(value)
+               for axis, value in zip(("tilt", "heading"), s["wander"]["overall"])},
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
             gravity=a.gravity,
             **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", s["gyro_bias"])},
             gyro_delay=float(par["gyro_delay"]),
             mag_delay=float(par["gyro_delay"] + s["mag_lag"]))
+
+    def _weight_of(self, name, weight, best):
+        """Weight of all hypotheses that agree with the likeliest one in a parameter."""
+        return float(weight[self._par[name] == self._par[name][best]].sum())
 
     def _counts(self):
         """Counts of the present stretch and of those before it, (1,) COUNTS."""

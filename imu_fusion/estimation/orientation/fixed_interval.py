@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from imu_fusion.estimation.orientation import bank
+from imu_fusion.estimation.orientation import bank, wander
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation.kernel import CURSOR, forward
 from imu_fusion.estimation.orientation.rows import clipped_axes, raise_to_limits, write_cov_attitude
@@ -48,16 +48,17 @@ def smooth(state: np.ndarray, par: np.ndarray, stamps: np.ndarray, samples: np.n
     """
     logs = stamps, samples, mag_stamps, mags
     tapes = np.zeros(_SEGMENT, es.TAPE)
-    bank.part(state)
-    several = len(state) > 1 and (len(mags) > 0 or state["field_norm"][0] > 0.0)
-    own = [rows, *(np.zeros_like(rows) for _ in state[1:] if several)]
+    bank.part(state, par)
+    parted = len(mags) > 0 or state["field_norm"][0] > 0.0
+    used = len(state) if parted else int(par["gyroscopes"][0])
+    own = [rows, *(np.zeros_like(rows) for _ in range(1, used))]
     passes = [_forward(state[k:k + 1], par[k:k + 1], logs, own[k], tapes)
               for k in range(len(own))]
-    weight = bank.weights(state)
+    weight = bank.weights(state, par)
     for k in np.flatnonzero(weight):
         _smooth(state[k:k + 1], par[k:k + 1], logs, own[k], tapes, passes[k])
     written = int(passes[0][-1][1]["row"][0])
-    if several:
+    if used > 1:
         bank.mix_all(np.stack([part[:written] for part in own]), weight, rows)
     return written
 
@@ -121,12 +122,11 @@ def _backward(tapes, before, final, par, rows, first, adjoint, information):
         span = max(tape.stamp - before_stamp, 1)
         while row >= begun:
             if rows[row].stamp == tape.stamp:
-                _correct_row(rows[row], p, after, cov_after, final[0].heading_var, limits)
+                _correct_row(rows[row], p, after, cov_after, final[0], limits)
             else:
                 part = (rows[row].stamp - before_stamp) / span
                 _correct_row(rows[row], p, (1.0 - part) * error + part * predicted,
-                             (1.0 - part) * cov_before + part * cov_after,
-                             final[0].heading_var, limits)
+                             (1.0 - part) * cov_before + part * cov_after, final[0], limits)
             row -= 1
         after, cov_after = error, cov_before
 
@@ -163,8 +163,9 @@ def _smoothed_cov(cov, information):
 
 
 @njit
-def _correct_row(row, p, error, cov, heading_var, limits):
-    """Apply the error (N,) and its covariance (12, 12) to one output row."""
+def _correct_row(row, p, error, cov, final, limits):
+    """Apply the error (N,) and its covariance (12, 12) to one output row. final: the state at the
+    recording's end."""
     frame = p.frame_from_enu
     back = quat_conjugate(frame)
     turn = quat_exp(error, 1.0)
@@ -188,5 +189,6 @@ def _correct_row(row, p, error, cov, heading_var, limits):
                                  + cov[_BIAS + i, _BIAS + i])
     raise_to_limits(gyr, clipped, limits)
     cov_world = cov[:3, :3].copy()    # other rows share cov
-    cov_world[2, 2] += heading_var
+    wander.widen(cov_world, final.wander.overall)
+    cov_world[2, 2] += final.heading_var
     write_cov_attitude(row, p, cov_world, quat_to_matrix(quat))

@@ -19,6 +19,7 @@ from imu_fusion.estimation.orientation import (
     imu_rejection,
     mag_queue,
     rotation_history,
+    wander,
 )
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation.alignment import Alignment
@@ -56,6 +57,7 @@ _STILL_LOCAL_RATE = 1e-3   # 1/s: at rest the local field is forgotten in a quar
 _BIAS_SD_FLOOR = 2e-4      # rad/s: a first second at rest shows no bias better than that
 _REST_SD = 0.01            # m/s and m: velocity and position at a start at rest
 _FIRST_DT = 1e-2           # s: step that stands in for the one before the first sample
+_NO_FIELD = 1e-9           # of its norm: a field without a horizontal part
 _NO_BLOCK = np.zeros(1, es.PREDICTION)
 _NO_SUM = np.zeros(1, MAG_SUM)
 
@@ -69,7 +71,8 @@ def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None
     s["rest"]["mean_rate"] = a.gyr_bias
     sd = np.zeros(es.N)
     sd[es.ATTITUDE:es.ATTITUDE + 2] = math.sqrt(a.cov_attitude_world[0, 0])
-    sd[es.GYRO_BIAS:es.GYRO_SCALE] = max(a.gyr_bias_sd, _BIAS_SD_FLOOR)
+    bias_sd = a.gyr_bias_sd if a.at_rest else p["sensor"]["gyro_bias_sd"]
+    sd[es.GYRO_BIAS:es.GYRO_SCALE] = max(bias_sd, _BIAS_SD_FLOOR)
     sd[es.GYRO_SCALE:es.VELOCITY] = p["sensor"]["gyro_scale_sd"]
     sd[es.VELOCITY:es.POSITION] = _REST_SD if a.at_rest else p["fusion"]["velocity_sd"]
     sd[es.POSITION:es.FIELD] = _REST_SD if a.at_rest else p["fusion"]["position_sd"]
@@ -329,16 +332,28 @@ def correct(s, p, error, tape):
     for i in range(3):
         if s.step.still:
             rest.gyro_bias(i, s, p, rows[0])
-            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)
+            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)[1]
         if p.use_acc:    # without force, velocity and position tell nothing
             bounded_motion.velocity(i, s, p, scale, rows[0])
-            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)
+            innovation, likely = es.update(s.cov, error, states, rows[0], tape)
+            s.log_likelihood += likely
+            if i < 2:
+                s.wander.velocity[i] = wander.low_passed(s.wander.velocity[i], innovation,
+                                                         s.block.time)
             bounded_motion.position(i, s, p, scale, rows[0])
-            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)
+            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)[1]
+    s.wander.since += s.block.time
     if s.mag_sum.count > 0:
         magnetometer.field(s, p, error, rows)
+        size = max(math.hypot(s.field[0], s.field[1]), _NO_FIELD)
+        across = 0.0
         for i in range(3):
-            es.update(s.cov, error, states, rows[i], tape)
+            innovation, _ = es.update(s.cov, error, states, rows[i], tape)
+            if i < 2:
+                across += innovation * (s.field[0] if i == 1 else -s.field[1]) / size
+        s.wander.field = wander.low_passed(s.wander.field, across, s.wander.since)
+        s.wander.since = 0.0
+    wander.judge(s.wander, s.block.time)
 
 
 @njit
@@ -401,6 +416,7 @@ def _write(s, p, row, taped):
         row.cov_acc[i, i] = var_acc
         row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
+    wander.widen(cov_world, s.wander.recent)
     cov_world[2, 2] += s.heading_var
     if not taped:    # else the smoother does it, after its correction
         raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)

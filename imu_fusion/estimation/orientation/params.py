@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +11,9 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.parameters.record import record
 from imu_fusion.sensors.params import sensor
 
+# Before there is a sample: one recording in twenty is near iron; what is stated of the gyroscope is
+# given up where the samples are a thousand times likelier without it.
+_LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.05), math.log(0.001)
 # Rotation from ENU to the world frame that is published, xyzw.
 _WORLD_FRAMES = {
     "enu": (0.0, 0.0, 0.0, 1.0),
@@ -118,8 +121,8 @@ class FusionParams(Parameters):
                   "fall, where it says nothing of gravity.")
     estimate_bias: bool = param(
         True, read_only=False,
-        doc="Whether gyroscope bias and scale are estimated; false holds them. Switch it off while "
-            "a motion is known to mislead it.")
+        doc="Whether gyroscope bias and scale are estimated; false holds them, those of each "
+            "hypothesis. Switch it off while a motion is known to mislead it.")
     velocity_walk: float = param(
         0.14, unit="m/s^2/sqrt(Hz)", low=0,
         doc="What the specific force does not tell of the motion. Raise it for vibration and "
@@ -139,6 +142,11 @@ class FusionParams(Parameters):
         doc="What distinguishes the field of a place from its surroundings, relative to its norm. "
             "Two values are two hypotheses that the samples decide between; gyro_mag takes the "
             "first. Raise the second near iron.")
+    gyro_factor: tuple[float, ...] = param(
+        (1.0, 5.0), low=1e-3, high=1e3, length=(1, 2),
+        doc="By how much sensor.gyro_bias_sd and sensor.gyro_scale_sd are larger than stated. Two "
+            "values are two hypotheses, each with each of the local field; gyro_mag takes the "
+            "first. Set it to 1 for a gyroscope that was calibrated.")
     local_field_time: float = param(
         0.3, unit="s", low=1e-3,
         doc="Time in which a moving sensor leaves that behind. Lengthen it for slow motion.")
@@ -294,23 +302,35 @@ class OrientationParams(Parameters):
 def kernel_parameters(params: OrientationParams) -> np.ndarray:
     """Parameters as the kernels read them: a structured array, an element for each hypothesis.
 
-    Beside the parameters under their names it has, at the top level, what follows from them:
-    local_field_sd of the hypothesis, gyro_delay, gyro_delay_sd, mag_delay_sd (s; zero where a
-    delay is taken as known), declination, heading_sd (rad), frame_from_enu (4,), use_acc and
-    rest_force (m/s^2; with gyro_mag neither the filter nor its rest detector looks at the
-    accelerometer), follows_field, as_printed.
+    The gyroscope's hypotheses come first, all with the first one of the field. Beside the
+    parameters under their names it has, at the top level, what follows from them: log_prior,
+    local_field_sd and gyro_factor of the hypothesis, how many gyroscopes there are, gyro_delay,
+    gyro_delay_sd, mag_delay_sd (s; zero where a delay is taken as known), declination, heading_sd
+    (rad), frame_from_enu (4,), use_acc and rest_force (m/s^2; with gyro_mag neither the filter nor
+    its rest detector looks at the accelerometer), follows_field, as_printed.
     """
-    hypotheses = params.fusion.local_field_sd if params.method == "fusion" else (
-        params.fusion.local_field_sd[:1])
-    return np.concatenate([_hypothesis(params, value) for value in hypotheses])
+    fields, factors = params.fusion.local_field_sd, params.fusion.gyro_factor
+    if params.method != "fusion":
+        fields, factors = fields[:1], factors[:1]
+    return np.concatenate([_hypothesis(params, field, factor) for field in fields
+                           for factor in factors])
 
 
-def _hypothesis(params: OrientationParams, local_field_sd: float) -> np.ndarray:
-    s = params.sensor
+def _hypothesis(params: OrientationParams, local_field_sd: float,
+                gyro_factor: float) -> np.ndarray:
+    s, f = params.sensor, params.fusion
+    gyroscopes = len(f.gyro_factor) if params.method == "fusion" else 1
+    log_prior = (_LOG_ODDS_IRON * (local_field_sd != f.local_field_sd[0])
+                 + _LOG_ODDS_POOR * (gyro_factor != f.gyro_factor[0]))
+    params = replace(params, sensor=replace(
+        s, gyro_bias_sd=gyro_factor * s.gyro_bias_sd, gyro_scale_sd=gyro_factor * s.gyro_scale_sd))
     with_acc = params.method == "fusion"
     return record(
         params,
+        log_prior=log_prior,
+        gyroscopes=gyroscopes,
         local_field_sd=local_field_sd,
+        gyro_factor=gyro_factor,
         gyro_delay=s.gyro_delay or 0.0,
         gyro_delay_sd=s.gyro_delay_sd if s.gyro_delay is None else 0.0,
         mag_delay_sd=s.mag_delay_sd if s.mag_delay is None else 0.0,

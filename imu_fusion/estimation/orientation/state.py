@@ -50,6 +50,16 @@ MOTION = np.dtype([
 ], align=True)
 """How much more the body moves than was said (motion_scale)."""
 
+WANDER = np.dtype([
+    ("velocity", "f8", 2),               # low-passed normalised innovations, horizontal
+    ("field", "f8"),                     # of the field, across its horizontal part
+    ("since", "f8"),                     # s since the last of the field
+    ("time", "f8"),                      # s that were judged so far
+    ("recent", "f8", 2),                 # mean squares of both: tilt, heading
+    ("overall", "f8", 2),                # the same of the whole recording
+], align=True)
+"""How far innovations are from white (wander)."""
+
 MAG_SUM = np.dtype([
     ("count", "i8"),
     ("field", "f8", 3),                  # of R m, relative to the norm
@@ -120,6 +130,7 @@ STATE = np.dtype([
     ("spike", GYRO_SPIKE),
     ("rest", REST),
     ("motion", MOTION),
+    ("wander", WANDER),
     ("counts", COUNTS),
     ("waiting_flags", "i8"),             # FLAG constants for the next row
     ("heading_known", "?"),
@@ -143,6 +154,8 @@ STATE = np.dtype([
     ("log_likelihood", "f8"),            # of all measurements so far, less a constant
     ("is_anchored", "?"),                # whether the heading is that of the first needle
     ("anchor", "f8", 12),                # rad, of that per hard (3) and soft iron (9)
+    ("field_scatter", "f8"),             # mean square per axis about ``field`` while moving
+    ("scattered", "i8"),                 # blocks that it is the mean of
     ("heading_var", "f8"),               # rad^2, of a heading that no filter can improve on
     # The block being collected.
     ("block", PREDICTION),

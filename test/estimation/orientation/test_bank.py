@@ -13,7 +13,7 @@ from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.samples.logs import MagLog
 from imu_fusion.simulation.rotation import Tumbling, earth_field, simulate
 from test.estimation.orientation.test_estimator import NOISY, feed, make
-from test.estimation.orientation.test_fusion import rmse_deg
+from test.estimation.orientation.test_fusion import local_errors, rmse_deg, tilt_errors_deg
 
 
 def recording(local_sd, seed=4, duration=30.0):
@@ -101,3 +101,20 @@ def test_the_number_of_hypotheses_cannot_change_while_running():
     with pytest.raises(ParameterError, match="local_field_sd"):
         OrientationEstimator().set_params(
             OrientationParams.from_mapping({"fusion.local_field_sd": 0.01}))
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+@pytest.mark.parametrize("local_sd", [0.3, 0.6])
+def test_a_magnetometer_does_no_more_harm_than_is_stated(local_sd, mode):
+    """Among iron far beyond either hypothesis: what it did to the first needle shows as the sensor
+    moves, from 2 s on."""
+    imu, mag, truth = recording(local_sd)
+    rows, without = (make({"mode": mode}).run(imu, m) for m in (mag, None))
+    d = local_errors(rows, truth)
+    distance = np.einsum("ni,nij,nj->n", d, np.linalg.inv(rows["cov_attitude"]), d)
+    late = imu.stamp > imu.stamp[0] + int(6e9)
+    assert (distance[late] < 14.16).mean() > 0.95
+    tilt, alone = (np.sqrt((tilt_errors_deg(r, truth) ** 2).mean()) for r in (rows, without))
+    turn = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    cov = turn @ rows["cov_attitude"] @ turn.transpose(0, 2, 1)
+    assert tilt < alone + np.degrees(np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]).mean()))

@@ -200,7 +200,7 @@ def test_a_delay_that_is_not_given_is_part_of_the_covariance_while_turning():
     shares = {}
     for name, changes in (("unset", {}), ("wrong", {"sensor.gyro_delay": 0.0}),
                           ("given", {"sensor.gyro_delay": 0.004})):
-        rows = make({"sensor.axes_sd": 1e-3, **changes}).run(imu, mag)
+        rows = make({"sensor.axes_sd": 1e-3, "fusion.gyro_factor": 1.0, **changes}).run(imu, mag)
         want = simulate(Tumbling(seed=1, rate_sd=3.0), 20.0, rate=200.0, seed=2)[2]
         want = Rotation.from_quat(want.quat_world_imu) * Rotation.from_rotvec(0.004 * rows["gyr"])
         error = (Rotation.from_quat(rows["quat_world_imu"]).inv() * want).as_rotvec()

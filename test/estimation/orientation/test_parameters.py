@@ -73,7 +73,8 @@ def test_heading_sd_is_the_anchored_headings(resting):
 
 def test_gyro_delay_sd_is_part_of_the_covariance_while_turning(moving):
     # Of one hypothesis: a mixture's is added in the axes of each.
-    rows = [run(moving, {"sensor.gyro_delay_sd": sd, "fusion.local_field_sd": 0.01})
+    rows = [run(moving, {"sensor.gyro_delay_sd": sd, "fusion.local_field_sd": 0.01,
+                         "fusion.gyro_factor": 1.0})
             for sd in (0.0, 0.01)]
     added = rows[1]["cov_attitude"] - rows[0]["cov_attitude"]
     rate = rows[0]["gyr"]

@@ -112,8 +112,11 @@ def judge_anchor(s, p):
         open_part = min(s.cov[i, i] / one_pose, 1.0) if one_pose > 0.0 else 1.0
         variance += s.anchor[a] ** 2 * open_part * (hard if a < 3 else soft)
     # The place turned the needle, too: by more than heading_sd allows where it is near iron.
+    # What places do on average is measured, whatever was expected of them.
     usual = p.fusion.local_field_sd[0]
-    place = max(p.local_field_sd ** 2 - usual ** 2, 0.0) * (
+    expected = (p.local_field_sd ** 2 + p.fusion.mag_disturbance_sd ** 2 + hard + soft)
+    excess = max(s.field_scatter - expected, 0.0)
+    place = max(p.local_field_sd ** 2 - usual ** 2 + excess, 0.0) * (
         s.anchor[0] ** 2 + s.anchor[1] ** 2 + s.anchor[2] ** 2)
     s.heading_var = min(p.heading_sd ** 2 + place + turned ** 2 + variance, es.UNIFORM_VARIANCE)
 
@@ -223,6 +226,10 @@ def field(s, p, error, rows):
     z = (total.field[0] / count, total.field[1] / count, total.field[2] / count)
     expected = (s.field[0] + s.local_field[0], s.field[1] + s.local_field[1],
                 s.field[2] + s.local_field[2])
+    if not s.step.still:    # at rest a place repeats itself
+        s.scattered += 1
+        off = ((z[0] - s.field[0]) ** 2 + (z[1] - s.field[1]) ** 2 + (z[2] - s.field[2]) ** 2) / 3.0
+        s.field_scatter += (off - s.field_scatter) / s.scattered
     deviation = abs(math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2) - 1.0)
     sd = p.fusion.mag_disturbance_sd + p.fusion.norm_deviation_factor * deviation
     variance = (sd * sd * max(_WHITE_TIME / s.block.time, 1.0 / count)

@@ -1,0 +1,47 @@
+"""Innovations that wander: what the filter states is then too small.
+
+Innovations of a filter that knows its errors are white. Where they keep a sign for seconds an
+error that is no state, or larger than was said, moves the estimate: a scale or bias of the
+gyroscope beyond belief, acceleration that lasts, a field that turns with the place. The low-passed
+innovation is then larger than that of white ones by the factor by which the estimate's error
+exceeds what is stated. That factor widens the attitude's covariance on output; gains stay.
+"""
+
+import math
+
+from imu_fusion.kernels import njit
+
+_TIME = 5.0            # s, of the low-pass: slower than the motion, faster than the tilt forgets
+_MEMORY = 10.0         # s, over which its square is judged
+TILT, HEADING = 0, 1   # of the mean squares
+
+
+@njit
+def low_passed(value, innovation, time):
+    """A low-passed unit innovation after another one of ``time`` s: of unit variance if white."""
+    keep = math.exp(-time / _TIME)
+    return keep * value + math.sqrt(1.0 - keep * keep) * innovation
+
+
+@njit
+def judge(wander, time):
+    """Mean squares after a block of ``time`` s, whose innovations are in."""
+    wander.time += time
+    for kind in range(2):
+        if kind == TILT:
+            square = 0.5 * (wander.velocity[0] ** 2 + wander.velocity[1] ** 2)
+        else:
+            square = wander.field ** 2
+        begun = max(wander.time, _TIME)
+        wander.overall[kind] += time / begun * (square - wander.overall[kind])
+        wander.recent[kind] += time / min(begun, _MEMORY) * (square - wander.recent[kind])
+
+
+@njit
+def widen(cov_world, squares):
+    """Widen an attitude's covariance (3, 3), world axes, in place, by mean squares (2,)."""
+    tilt = math.sqrt(max(squares[TILT], 1.0))
+    heading = math.sqrt(max(squares[HEADING], 1.0))
+    for i in range(3):
+        for j in range(3):
+            cov_world[i, j] *= (heading if i == 2 else tilt) * (heading if j == 2 else tilt)
