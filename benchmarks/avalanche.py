@@ -1,7 +1,13 @@
-"""The avalanche ball, simulated, with its truth: python -m benchmarks.avalanche [SEEDS]"""
+"""The avalanche ball, simulated, with its truth: python -m benchmarks.avalanche [SEEDS [WHOLE]]
+
+WHOLE: of how many seeds the 70 s are smoothed, too (minutes each).
+"""
 
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +35,7 @@ from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.surfaces.file import load_surface
 
 PRESET = Path(__file__).parent.parent / "config" / "avalanche.yaml"
-SEEDS, WHOLE_SEEDS = 50, 10
+SEEDS, FRESH_SEEDS, WHOLE_SEEDS = 50, 10, 6
 END = 8.99            # s, where the paper ends, before the gap
 FIX_SD = 0.2          # m, of fixes averaged over minutes
 WITHIN = 0.05         # s, of a transition
@@ -83,22 +89,22 @@ def paper(ball):
     velocity = ball.motion.vel[rows] @ ball.axes
     flight = int(np.searchsorted(result.samples.time, ball.motion.phases[3].start))
 
-    def score(track):
+    def errors(track):
         place = track.position @ ball.axes
         return np.concatenate([
             rms(place - moved), rms(track.vel @ ball.axes - velocity),
             [abs(np.degrees(np.arctan2(place[flight, 2], place[flight, 0])
                             - np.arctan2(moved[flight, 2], moved[flight, 0])))]])
 
-    found = {"laboratory calibration": score(result.track)}
+    found = {"laboratory calibration": errors(result.track)}
     g = ball.avalanche.gravity
     for level in ("position", "velocity"):
         for model in (1, 2, 3):
             calibration = calibrate_in_situ(result.samples, Constraint(
                 result.axes[:, 2], g, level, model))
-            found[f"{level}, model {model}, as printed"] = score(
+            found[f"{level}, model {model}, as printed"] = errors(
                 dead_reckon(calibration.apply(result.samples), g))
-    found["position, model 2, rest and realignment"] = score(result.improved_track)
+    found["position, model 2, rest and realignment"] = errors(result.improved_track)
     return found
 
 
@@ -151,28 +157,30 @@ def calibration_errors(ball):
     return (ball.calibration.offset - ball.log.mag_offset) / sd
 
 
-def collect(seeds, errors=BallErrors(), whole=0):
-    """Everything of all seeds."""
-    out = {"orientation": [], "paper": [], "end": [], "start": [], "whole": [], "phases": [],
-           "mag": []}
-    for seed in seeds:
-        ball = Ball(seed, errors)
-        error, cov, rows = orientation(ball, ball.between(-3.0, END))
-        size = np.linalg.norm(error, axis=1)
-        sd = np.sqrt(np.trace(cov, axis1=1, axis2=2))
-        out["orientation"].append([np.mean(size ** 2), np.mean(size < 3.0 * sd), np.mean(sd ** 2),
-                                   nees(error, cov).mean()])
-        out["paper"].append(paper(ball))
-        imu = recover(ball.log.imu, ball.log.mag, recovery_params(
-            preset((SmoothingParams, SmootherNodeParams), "smoother").replace(**ball.known)))
-        out["end"].append(smoother(ball, imu, -3.0, END, True))
-        out["start"].append(smoother(ball, imu, -3.0, END, False))
-        if seed < whole:
-            out["whole"].append(smoother(ball, imu, -3.0, 73.0, True))
-        out["phases"].append(phases(ball, rows))
-        out["mag"].append(calibration_errors(ball))
-        print(seed, f"orientation {np.degrees(np.sqrt(np.mean(size ** 2))):.1f} deg",
-              out["end"][-1].round(2), out["phases"][-1].round(3), flush=True)
+def attitude_score(ball):
+    """Mean squares of error and of what is stated (rad^2), share within 3 sigma, NEES; rows."""
+    error, cov, rows = orientation(ball, ball.between(-3.0, END))
+    size, variance = np.linalg.norm(error, axis=1), np.trace(cov, axis1=1, axis2=2)
+    return [np.mean(size ** 2), np.mean(size < 3.0 * np.sqrt(variance)), variance.mean(),
+            nees(error, cov).mean()], rows
+
+
+def score(seed, whole):
+    """Everything of one seed, by name."""
+    ball, out = Ball(seed), {}
+    out["orientation"], rows = attitude_score(ball)
+    out["paper"] = paper(ball)
+    imu = recover(ball.log.imu, ball.log.mag, recovery_params(
+        preset((SmoothingParams, SmootherNodeParams), "smoother").replace(**ball.known)))
+    out["end"] = smoother(ball, imu, -3.0, END, True)
+    out["start"] = smoother(ball, imu, -3.0, END, False)
+    if seed < whole:
+        out["whole"] = smoother(ball, imu, -3.0, 73.0, True)
+    if seed < FRESH_SEEDS:
+        out["fresh"] = attitude_score(Ball(seed, replace(
+            BallErrors(), acc_matrix_sd=0.002, acc_bias_sd=0.02)))[0]
+    out["phases"], out["mag"] = phases(ball, rows), calibration_errors(ball)
+    print(seed, out["end"].round(2), out["phases"].round(3), flush=True)
     return out
 
 
@@ -180,11 +188,12 @@ def triple(values, digits=2):
     return "/".join(f"{v:.{digits}f}" for v in values)
 
 
-def report(out, fresh, count, whole):
+def report(seeds, count):
     """Rows of the table: what, measured, goal or what the paper says."""
-    rows = []
-    for name, found in (("", out), (", accelerometer fresh from its calibration", fresh)):
-        o = np.array(found["orientation"])
+    rows, out = [], {key: [s[key] for s in seeds if key in s] for key in seeds[0]}
+    whole = len(out.get("whole", ()))
+    for name, key in (("", "orientation"), (", accelerometer fresh from its calibration", "fresh")):
+        o = np.array(out[key])
         rows.append((f"orientation, preset, smoothed{name}: RMS, deg; share within 3 sigma, %; stated over actual; NEES",
                      f"{np.degrees(np.sqrt(o[:, 0].mean())):.2f}; {100 * o[:, 1].mean():.0f}; "
                      f"{np.sqrt(o[:, 2].mean() / o[:, 0].mean()):.2f}; {o[:, 3].mean():.1f}",
@@ -205,6 +214,8 @@ def report(out, fresh, count, whole):
             ("end", f"smoother, start and end known, to {END:.0f} s", "goal .5/.8/.15, NEES 2 to 4, 2 to 4"),
             ("start", f"smoother, start only, to {END:.0f} s", "stated; NEES 2 to 4"),
             ("whole", f"smoother, start and end known, 70 s through the gap ({whole} seeds)", "goal .5/.8/.15, NEES 2 to 4, 2 to 4")):
+        if key not in out:
+            continue
         s = np.array(out[key])
         mean = np.sqrt(np.mean(s[:, :6] ** 2, axis=0))
         rows.append((f"{name}: position, m (stated); NEES; attitude, deg; NEES (medians); converged",
@@ -220,21 +231,14 @@ def report(out, fresh, count, whole):
     rows.append(("magnetometer in situ: offsets within 3 sigma, % of axes", f"{100 * np.mean(m < 3):.0f}", "goal 95"))
     write_table("avalanche", ("what", "measured", "goal, or what the paper says"), rows,
                 f"Simulated balls on a plane of 32 deg, {count} seeds (fresh accelerometer: "
-                f"{len(fresh['orientation'])}): errors of `imu_fusion.simulation.ball_sensors`, among them 3 % of the "
+                f"{len(out['fresh'])}): errors of `imu_fusion.simulation.ball_sensors`, among them 3 % of the "
                 "accelerometer's matrix. Fresh: 0.2 % and 0.02 m/s^2. RMS over samples and seeds; NEES: 3 is "
                 f"ideal. Fixes of the start and the end: {FIX_SD} m.")
 
 
-def main(count=SEEDS):
-    out = collect(range(count), whole=min(count, WHOLE_SEEDS))
-    fresh = {"orientation": []}
-    for seed in range(min(count, 20)):
-        ball = Ball(seed, replace(BallErrors(), acc_matrix_sd=0.002, acc_bias_sd=0.02))
-        error, cov, _ = orientation(ball, ball.between(-3.0, END))
-        size, sd = np.linalg.norm(error, axis=1), np.sqrt(np.trace(cov, axis1=1, axis2=2))
-        fresh["orientation"].append([np.mean(size ** 2), np.mean(size < 3.0 * sd),
-                                     np.mean(sd ** 2), nees(error, cov).mean()])
-    report(out, fresh, count, min(count, WHOLE_SEEDS))
+def main(count=SEEDS, whole=WHOLE_SEEDS):
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        report(list(pool.map(partial(score, whole=whole), range(count))), count)
 
 
 if __name__ == "__main__":

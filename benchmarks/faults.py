@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks import hostile_peers
 from benchmarks.flow import DRIVER
-from benchmarks.table import write_table
+from benchmarks.table import table
 from imu_fusion.errors import BagError
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.nodes.processes import NodeProcesses
@@ -39,6 +39,20 @@ START, STEP = 1_700_000_000_000_000_000, 5_000_000  # ns
 COUNT = 1600  # Imu samples of the recording; a magnetometer sample with every fourth
 SENSORS = ("/imu/data_raw", "/imu/mag")
 NOTHING = "nothing"  # of a recording that was not to be
+PAGE = Path(__file__).parents[1] / "docs" / "faults.md"
+TEXT = """<!-- written by python -m benchmarks.faults -->
+# What can happen to the nodes
+
+Real processes of replayer, orientation estimator or smoother, and recorder, each situation in a ROS
+domain of its own. *Amiss* would be a process that does not end, a traceback, a recording that cannot
+be read, or anything missing while the exit codes of replayer and recorder are 0.
+
+Exit code 3 says that something was lost; 130 is SIGINT, as any node is ended that would live on; -9
+is kill -9. *Recorded* are messages of Imu and magnetometer, of those in the recording that is
+played; the lines that a recording tells of its losses are those that `imu_fusion info` shows. What
+hostile peers send: `benchmarks/hostile_peers.py`.
+
+"""
 
 
 def write_bag(path: Path, count: int = COUNT) -> Path:
@@ -279,7 +293,7 @@ def hostile(kind: str, trial: Trial) -> None:
 
 def hostile_session(kind: str, trial: Trial) -> None:
     """The same beside a replay."""
-    trial.play()
+    trial.play(rate=0.4)
     with trial.beside("-m", "benchmarks.hostile_peers", kind):
         trial.end("replayer", "recorder")
     trial.end("orientation_estimator", number=signal.SIGINT)
@@ -326,10 +340,7 @@ def main(part: str = "") -> None:
                              "; ".join(trial.recorded), "; ".join(trial.amiss) or "nothing"])
                 print(*rows[-1], sep=" | ", flush=True)
     if not part:
-        write_table("faults", ["what is done", "exit codes", "recorded", "amiss"], rows, (
-            "`python -m benchmarks.faults`: exit code 3 says that something was lost, 130 is "
-            "SIGINT, -9 is kill -9. Sent are the messages of Imu and magnetometer; what lines are "
-            "told, `imu_fusion info` shows."))
+        PAGE.write_text(TEXT + table(["what is done", "exit codes", "recorded", "amiss"], rows))
 
 
 if __name__ == "__main__":

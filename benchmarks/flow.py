@@ -303,7 +303,7 @@ def main(part="", count=None):
             f"`python -m benchmarks.flow`: {SECONDS:g} s of four accelerometers at 1 kHz, Imu and "
             f"magnetometer at 200 Hz and fixes at 10 Hz, {total} messages to be recorded in each "
             "session; at rate 0 where nothing is done to nodes, else in real time. In brackets: "
-            "how often. Exit code 1 says that something is missing, -9 is ours. A recorder "
+            "how often. Exit code 3 says that something is missing, 130 and -9 are ours. A recorder "
             "tells numbers only where it knows them: not what a vanished node would have sent.")
 
 

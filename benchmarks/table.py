@@ -5,11 +5,16 @@ from pathlib import Path
 RESULTS = Path(__file__).parent / "results"
 
 
-def write_table(name, header, rows, note=""):
-    """Print a table and write it to ``benchmarks/results/<name>.md``."""
+def table(header, rows):
+    """The lines of a table."""
     lines = ["| " + " | ".join(map(str, header)) + " |", "|" + "---|" * len(header)]
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
-    text = "\n".join(lines) + "\n" + (f"\n{note}\n" if note else "")
+    return "\n".join(lines) + "\n"
+
+
+def write_table(name, header, rows, note=""):
+    """Print a table and write it to ``benchmarks/results/<name>.md``."""
+    text = table(header, rows) + (f"\n{note}\n" if note else "")
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.md").write_text(text)
     print(text)

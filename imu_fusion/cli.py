@@ -256,6 +256,21 @@ def convert(source: str, out: str, topics: tuple[str, ...], description: str | N
 
 
 @cli.command()
+@click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--topic", "topics", multiple=True, help="Only this topic. Repeatable.")
+def export(bag: str, out: str, topics: tuple[str, ...]) -> None:
+    """Write BAG, recorded or estimated, as tables into the new folder OUT.
+
+    A CSV file for each topic, with units in its header and a row for each message; poses
+    also as TUM trajectories, fixes as a GPX track.
+    """
+    from imu_fusion.recordings.export import export as export_tables
+    for name, rows in export_tables(bag, out, topics).items():
+        click.echo(f"written: {Path(out) / name} with {rows} rows")
+
+
+@cli.command()
 @click.argument("source", type=click.Path())
 @click.option("--out", type=click.Path(), help="File to write; without it, the text is shown.")
 @click.option("--overwrite", is_flag=True, help="Replace it.")

@@ -5,6 +5,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+came: list[int] = []
+"""Signals that :func:`interrupt` has raised: destructors and callbacks swallow exceptions, so who
+waits in a loop looks here, too."""
+
 Handler = Callable[[int, FrameType | None], object]
 
 
@@ -53,4 +57,5 @@ def held() -> Iterator[None]:
 
 def interrupt(number: int, frame: FrameType | None = None) -> None:
     """The handler that raises :class:`Interrupted` wherever the program is."""
+    came.append(number)
     raise Interrupted(number)

@@ -63,6 +63,8 @@ ARROWS = {
 ARROWS_OF_FILES = {
     # A table of accelerometers is judged by the estimator that shall read it.
     "recordings/array_parameters.py": ("estimation.acceleration_field", "streams"),
+    # People read roll, pitch and yaw.
+    "recordings/export.py": ("geometry",),
 }
 
 # Below `messages`, and in the formats of devices, numbers are computed: no ROS, no files, no plots,
@@ -83,7 +85,7 @@ COMPUTING_OF_FILES = {
         "source": {"re"}, "table": {"csv", "decimal", "re"}, "header": {"re"}, "sketch": {"re"},
         "registry": {"pathlib", "re"}, "avanode": {"re"},
         "sensor_logger": {"csv", "json", "pathlib"}, "ximu3": {"struct"}, "ulog": {"io", "pyulog"},
-        "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib"},
+        "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib", "zipfile"},
         "gnss": {"pynmeagps", "pyubx2", "re"}, "gpx": {"xml"}}.items()},
     "kernels.py": {"hashlib", "os", "pathlib", "pickle", "re", "shutil", "sys", "tempfile", "time"},
 }

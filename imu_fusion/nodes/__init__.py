@@ -45,8 +45,9 @@ NODES = {
 
 def main(args: Sequence[str] | None = None, name: str = "") -> int:
     """Entry point of every executable: start the node that has its name; returns the exit code."""
-    from imu_fusion.signals import Interrupted, handled, interrupt
+    from imu_fusion.signals import Interrupted, came, handled, interrupt
     name = name or Path(sys.argv[0]).stem
+    came.clear()
     try:
         with handled(interrupt):    # from here on: importing takes a second
             module = importlib.import_module(f"imu_fusion.nodes.{name}")

@@ -27,7 +27,7 @@ from imu_fusion.nodes import NODES
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
 from imu_fusion.parameters.declare import ParameterInfo, Parameters, unknown_parameter
-from imu_fusion.signals import Interrupted, exit_code, handled, interrupt
+from imu_fusion.signals import Interrupted, came, exit_code, handled, interrupt
 
 P = TypeVar("P", bound=Parameters)
 
@@ -225,29 +225,28 @@ def run_node(node_class: type[Node], args: Sequence[str] | None = None) -> int:
     if own:
         return _complain(node_class, f"unexpected argument '{own[0]}'; parameters are given as "
                          "--ros-args -p name:=value (see --help)")
-    signals: list[int] = []
 
     def take(number, frame):
-        signals.append(number)
         if is_compiling():
             interrupt(number)    # numba would go on for a minute
+        came.append(number)
 
     try:
         with handled(take):
-            code = _start(node_class, arguments, signals)
+            code = _start(node_class, arguments)
     except Interrupted as error:
         return error.code
-    return exit_code(signals[0]) if signals else code
+    return exit_code(came[0]) if came else code
 
 
-def _start(node_class, arguments, signals):
+def _start(node_class, arguments):
     try:
         # Our own handlers: rclpy's would close the context before the node can end its
         # session and its files.
         use_fast_heartbeats()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         files = [file for flag, file in zip(arguments, arguments[1:]) if flag == "--params-file"]
-        return _run(node_class, signals, files)
+        return _run(node_class, files)
     except ImuFusionError as error:
         return _complain(node_class, error)
     except Exception as error:
@@ -265,14 +264,14 @@ def use_fast_heartbeats() -> None:
             Path(__file__).parent / "flow" / "fastdds.xml")
 
 
-def _run(node_class, signals, params_files):
+def _run(node_class, params_files):
     node = node_class(params_files=params_files)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     stopping = False
     try:
-        while rclpy.ok() and not node.finished and len(signals) < 2:
-            if signals and not stopping:
+        while rclpy.ok() and not node.finished and len(came) < 2:
+            if came and not stopping:
                 stopping = True
                 node.stop()
             else:

@@ -1,57 +1,26 @@
 """The driver: samples of a device, under the clock of this computer, on the standard topics."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.qos import QoSProfile
 
 from imu_fusion.errors import DeviceError, ParameterError, SampleError
-from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, POSE, TWIST
-from imu_fusion.messages.samples import NoiseSd, sample_messages
-from imu_fusion.nodes.base import IDLE, Node, message_class
+from imu_fusion.nodes.base import IDLE, Node
+from imu_fusion.nodes.device_file import DeviceFile, Lot
+from imu_fusion.nodes.device_topics import DeviceTopic, DriverSensor
 from imu_fusion.nodes.flow import reliable_qos, sensor_qos, steady_timer
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.recordings.source_storage import format_of, read_source
-from imu_fusion.samples.logs import Log
-from imu_fusion.sensors.params import sensor
 from imu_fusion.sources.clock import DeviceClock
-from imu_fusion.sources.description import Description
-from imu_fusion.sources.registry import FORMATS, HEAD, file_source, live_source, recognise
-from imu_fusion.sources.source import (
-    ARRAY_TOPIC,
-    FIX_TOPIC,
-    IMU_TOPIC,
-    MAG_TOPIC,
-    REFERENCE_TOPIC,
-    VELOCITY_TOPIC,
-    Block,
-    Source,
-)
-from imu_fusion.sources.table import TableSource
+from imu_fusion.sources.registry import FORMATS, HEAD, live_source, recognise
+from imu_fusion.sources.source import ARRAY_TOPIC, FIX_TOPIC, IMU_TOPIC, MAG_TOPIC, Source
 from imu_fusion.sources.transports.connection import Chunk, Connection
 from imu_fusion.sources.transports.live import open_transport
 
 _FILE = "file://"
-_TYPES = {IMU_TOPIC: IMU, MAG_TOPIC: MAG, FIX_TOPIC: FIX, VELOCITY_TOPIC: TWIST,
-          REFERENCE_TOPIC: POSE}
 _FOREIGN = 4096      # bytes without a sample, after which the format is doubted
-_RATED = 20          # samples that tell the rate
-_GAP = 1.8           # usual intervals: a longer one has lost a sample
-_PLAYED = 0.01       # s of a file that are published at once
-
-
-@dataclass(frozen=True)
-class DriverSensor(Parameters):
-    """``sensor.*``: noise of what tells no accuracy itself. Defaults are those of phones."""
-
-    gyro_noise_density: float = sensor("gyro_noise_density", 3e-4)
-    acc_noise_density: float = sensor("acc_noise_density", 2e-3)
-    mag_noise_sd: float = sensor("mag_noise_sd", 1e-6)
 
 
 @dataclass(frozen=True)
@@ -85,13 +54,6 @@ class DriverParams(Parameters):
     sensor: DriverSensor = DriverSensor()
 
 
-class Lot(NamedTuple):
-    """Samples that came together."""
-
-    blocks: list[Block]
-    arrival: int
-
-
 class Driver(Node):
     """Samples of a device, live or from its file, on the standard topics."""
 
@@ -106,9 +68,9 @@ class Driver(Node):
                                  "transport:=serial:///dev/ttyACM0, tcp://HOST:PORT or others")
         self._description = None if p.description is None else read_yaml(p.description)
         self._connection: Connection | None = None
-        self._file: _File | None = None
+        self._file: DeviceFile | None = None
         if p.transport.startswith(_FILE):
-            self._file = _File(Path(p.transport.removeprefix(_FILE)), self._description,
+            self._file = DeviceFile(Path(p.transport.removeprefix(_FILE)), self._description,
                                str(p.description))
             self._source: Source = self._file.source
         else:
@@ -119,7 +81,8 @@ class Driver(Node):
                 p.longest_pause, p.reconnect)
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()
         topics = self._file.topics if self._file else self._source.topics
-        self._outputs = {topic: _Output(self, topic, p, qos) for topic in topics}
+        self._outputs = {topic: DeviceTopic(self, topic, self._frame(topic), p.sensor, qos)
+                         for topic in topics}
         self._clocks: dict[str, DeviceClock] = {}
         self._held: list[Lot] = []    # until the clocks are known
         self._doubted = b""           # the first bytes, while no sample has come of them
@@ -149,6 +112,14 @@ class Driver(Node):
             self._end(self._connection.problem)
         return IDLE
 
+    def _frame(self, topic: str) -> str | None:
+        """frame_id of a topic; None: that of the samples."""
+        if topic in (IMU_TOPIC, MAG_TOPIC):
+            return self._p.imu_frame
+        if topic.startswith(ARRAY_TOPIC):
+            return None
+        return self._p.gnss_frame if topic == FIX_TOPIC else self._p.world_frame
+
     def stop(self) -> None:
         """Let go of the device."""
         self._publish_held()
@@ -168,6 +139,8 @@ class Driver(Node):
         self._publish(Lot(self._source.finish(), time.time_ns()))
         self._publish_held()
         self.finished = True
+        if problem and not self._connections:
+            raise DeviceError(problem)
         if problem:
             self.problems.append(problem)
 
@@ -175,9 +148,10 @@ class Driver(Node):
         """Say what has changed about the device."""
         if connection.problem != self._problem:
             self._problem = connection.problem
-            if self._problem:
-                again = "; waiting for it" if self._p.reconnect else ""
-                self.get_logger().warning(self._problem + again)
+            if self._problem and self._p.reconnect:
+                self.get_logger().warning(f"{self._problem}; waiting for it")
+            elif self._problem and connection.connections:
+                self.get_logger().warning(self._problem)
         if connection.connections != self._connections:
             self._connections = connection.connections
             self.get_logger().info(f"{self._p.transport}: connected")
@@ -249,7 +223,7 @@ class Driver(Node):
                 stamp = log.stamp
             self._outputs[topic].publish(log, stamp)
 
-    def _play(self, file: "_File") -> float:
+    def _play(self, file: DeviceFile) -> float:
         """Publish what is due of a file."""
         lot, pause = file.due()
         if lot.blocks:
@@ -287,92 +261,3 @@ class Driver(Node):
         if worries:
             return DiagnosticStatus.WARN, self._problem or "stamps do not rise", values
         return DiagnosticStatus.OK, "running", values
-
-
-class _Output:
-    """One topic: its publisher, and how regular what it publishes is."""
-
-    def __init__(self, node: Node, topic: str, p: DriverParams, qos: QoSProfile) -> None:
-        layout = IMU if topic.startswith(ARRAY_TOPIC) else _TYPES.get(topic, POSE)
-        self._publisher = node.create_publisher(message_class(layout.msgtype), topic, qos)
-        self._frame = {IMU_TOPIC: p.imu_frame, MAG_TOPIC: p.imu_frame,
-                       FIX_TOPIC: p.gnss_frame}.get(
-            topic, None if topic.startswith(ARRAY_TOPIC) else p.world_frame)
-        self._sensor = p.sensor
-        self.count = self.gaps = self.backwards = 0
-        self._last: int | None = None
-        self._intervals: list[int] = []    # the first ones
-        self._usual = 0.0
-        self._asked = (time.monotonic(), 0)
-
-    def subscribers(self) -> int:
-        """Number of subscriptions."""
-        return self._publisher.get_subscription_count()
-
-    def rate(self) -> float:
-        """Messages a second since it was asked last."""
-        (before, count), self._asked = self._asked, (time.monotonic(), self.count)
-        return (self.count - count) / max(self._asked[0] - before, 1e-9)
-
-    def publish(self, log: Any, stamp: np.ndarray) -> None:
-        """Publish samples under other stamps."""
-        self._regard(stamp)
-        for cdr in sample_messages(replace(log, stamp=stamp), self._noise(), self._frame):
-            self._publisher.publish(cdr)
-        self.count += len(stamp)
-
-    def _noise(self) -> NoiseSd:
-        """Unknown until the rate is known."""
-        per_root = np.sqrt(NANOSECONDS / self._usual) if self._usual else 0.0
-        return NoiseSd(self._sensor.gyro_noise_density * per_root,
-                       self._sensor.acc_noise_density * per_root, self._sensor.mag_noise_sd)
-
-    def _regard(self, stamp: np.ndarray) -> None:
-        step = np.diff(stamp, prepend=stamp[0] if self._last is None else self._last)
-        if self._last is None:
-            step = step[1:]
-        self._last = int(stamp[-1])
-        self.backwards += int((step <= 0).sum())
-        if not self._usual:
-            self._intervals += step[step > 0].tolist()
-            if len(self._intervals) >= _RATED:
-                self._usual = float(np.median(self._intervals))
-        else:
-            self.gaps += int((step > _GAP * self._usual).sum())
-
-
-class _File:
-    """A file of a device, played at its own pace."""
-
-    def __init__(self, path: Path, description: Any, described_in: str) -> None:
-        if not path.exists():
-            raise DeviceError(f"{path}: no such file")
-        known = format_of(path)
-        if description is not None and (known is None or not known.options):
-            self.source: Source = TableSource(Description.from_mapping(description, described_in))
-        elif known is not None:
-            self.source = file_source(known, description, described_in)
-        else:
-            raise DeviceError(f"{path}: of no format that is known; a table needs a description")
-        blocks = read_source(path, self.source)
-        self._logs: dict[tuple[str, str], Log] = {}
-        for key in dict.fromkeys((block.topic, block.clock) for block in blocks):
-            joined = Log.joined([b.log for b in blocks if (b.topic, b.clock) == key])
-            self._logs[key] = joined[np.argsort(joined.stamp, kind="stable")]
-        if not self._logs:
-            raise DeviceError(f"{path}: without any samples")
-        self.topics = tuple(dict.fromkeys(topic for topic, _ in self._logs))
-        self._first = min(int(log.stamp[0]) for log in self._logs.values())
-        self._last = max(int(log.stamp[-1]) for log in self._logs.values())
-        self._played = self._first - 1
-        self._begun: float | None = None
-
-    def due(self) -> tuple[Lot, float | None]:
-        """(samples that are due, s until the next ones; None at the end)."""
-        if self._begun is None:
-            self._begun = time.monotonic()
-        until = self._first + round((time.monotonic() - self._begun) * NANOSECONDS)
-        blocks = [Block(topic, part, clock) for (topic, clock), log in self._logs.items()
-                  if len(part := log.between(self._played + 1, until + 1))]
-        self._played = until
-        return Lot(blocks, time.time_ns()), None if until >= self._last else _PLAYED

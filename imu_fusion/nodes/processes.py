@@ -15,8 +15,9 @@ import yaml
 from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.kernels import NOTICE
-from imu_fusion.signals import held
+from imu_fusion.signals import Interrupted, came, held
 
+_CLAIM = 9    # of the ports of a domain, the one that says that nodes will come
 _PATIENCE = 15.0  # s, in which nodes end their sessions and files
 
 
@@ -24,26 +25,34 @@ class NodeError(ImuFusionError):
     """A node did not start, did not end or ended with an error."""
 
 
-def free_domain() -> int:
-    """A ROS domain id (1 to 101) that nobody on this machine uses.
+def claim_domain() -> tuple[int, socket.socket]:
+    """A ROS domain id (1 to 101) that nobody on this machine uses, and the socket whose being open
+    claims it: nodes need a second until they are seen.
 
-    DDS participants of a domain bind the UDP ports from 7400 + 250 * id on.
+    DDS participants of a domain bind the UDP ports from 7400 + 250 * id on, but for 2 to 9 of them.
     """
     first = os.getpid() % 101
     for i in range(101):
         domain = 1 + (first + i) % 101
-        if all(_is_free(7400 + 250 * domain + offset) for offset in (0, 10, 11, 12)):
-            return domain
+        ports = [7400 + 250 * domain + offset for offset in (_CLAIM, 0, 10, 11, 12)]
+        bound = [found for port in ports if (found := _bound(port)) is not None]
+        is_free = len(bound) == len(ports)
+        for probe in bound[1:] if is_free else bound:
+            probe.close()
+        if is_free:
+            return domain, bound[0]
     raise NodeError("all ROS domain ids from 1 to 101 are in use on this machine")
 
 
-def _is_free(port):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", port))
-        except OSError:
-            return False
-    return True
+def _bound(port):
+    """A socket bound to an UDP port, None if it is in use."""
+    probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        probe.bind(("", port))
+    except OSError:
+        probe.close()
+        return None
+    return probe
 
 
 class NodeProcesses:
@@ -59,7 +68,10 @@ class NodeProcesses:
     """
 
     def __init__(self, logs: str | Path | None = None, domain: int | None = None):
-        self.domain = free_domain() if domain is None else domain
+        self._claim: socket.socket | None = None
+        if domain is None:
+            domain, self._claim = claim_domain()
+        self.domain = domain
         self._logs = Path(logs or tempfile.mkdtemp(prefix="imu_fusion_"))
         self._logs.mkdir(parents=True, exist_ok=True)
         self._processes: dict[str, subprocess.Popen] = {}
@@ -82,6 +94,8 @@ class NodeProcesses:
             for process in self._processes.values():
                 process.kill()
                 process.wait()
+            if self._claim is not None:
+                self._claim.close()
 
     def start(self, node: str, show: bool = False, params_file: str | Path | None = None,
               **parameters: object) -> None:
@@ -119,6 +133,8 @@ class NodeProcesses:
         deadline = time.monotonic() + timeout
         while self._processes[node].poll() is None:
             self._announce_compiling()
+            if came:
+                raise Interrupted(came[0])
             for name, process in self._processes.items():
                 if process.poll() not in (None, 0, INCOMPLETE):
                     raise NodeError(f"node {name} ended with code {process.returncode}: "

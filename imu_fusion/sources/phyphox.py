@@ -15,6 +15,7 @@ import io
 import json
 import math
 import re
+import zipfile
 from pathlib import PurePosixPath
 from urllib.parse import quote
 
@@ -29,6 +30,7 @@ from imu_fusion.sources.source import (
     FIX_TOPIC,
     FIXED,
     IMU_TOPIC,
+    LARGEST_WHOLE,
     MAG_TOPIC,
     NO_FIX,
     VELOCITY_TOPIC,
@@ -214,6 +216,7 @@ def _excel(part: str, data: bytes):
     except ImportError:
         raise SampleError(f"{part}: reading Excel files needs python-calamine: pip install "
                           "'imu_fusion[devices]', or export CSV instead") from None
+    _check_unpacked(part, data)
     try:
         book = CalamineWorkbook.from_filelike(io.BytesIO(data))
         tables = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
@@ -227,6 +230,18 @@ def _excel(part: str, data: bytes):
         if found.lines:
             meta = {"Metadata Time": "time", "Metadata Device": "device"}.get(name, name)
             yield meta, _Sheet(f"{part}, sheet {name}", reader, found)
+
+
+def _check_unpacked(part: str, data: bytes) -> None:
+    """An .xlsx is an archive, which its reader unpacks at once."""
+    if data.startswith(b"PK"):
+        try:
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                size = sum(entry.file_size for entry in archive.infolist())
+        except (zipfile.BadZipFile, ValueError) as error:
+            raise SampleError(f"{part}: no Excel file that can be read ({error})") from None
+        if size > min(LARGEST_WHOLE, 1000 * len(data)):
+            raise SampleError(f"{part}: would unpack to {size >> 20} MB")
 
 
 def _kind(name: str, sheet: _Sheet) -> str:

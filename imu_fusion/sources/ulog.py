@@ -5,6 +5,7 @@ left, up and east, north, up. Times count from boot; where the receiver knew UTC
 to it, else they count from :data:`~imu_fusion.sources.source.EPOCH`.
 """
 
+import contextlib
 import io
 from typing import Any
 
@@ -35,8 +36,28 @@ _ENU_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _NO_FORCE = 0x7FFFFFFF    # as accelerometer_timestamp_relative
 _GAUSS = 1e-4
 _FIX_3D = 3
+_READS = 200_000     # more than a step back of a message takes, byte by byte
 _WANTED = ["sensor_combined", "vehicle_magnetometer", "sensor_mag", "vehicle_gps_position",
            "sensor_gps", "vehicle_attitude"]
+
+
+class _StuckError(Exception):
+    """Not an error that pyulog catches."""
+
+
+class _Bytes(io.BytesIO):
+    """Ends a reader that goes in circles: after damage pyulog steps back, at a cut end for ever."""
+
+    _furthest = _reads = 0
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        self._reads += 1
+        if self.tell() > self._furthest:
+            self._furthest, self._reads = self.tell(), 0
+        elif self._reads > _READS:
+            raise _StuckError("no message begins where one should")
+        return data
 
 
 class Ulog(Source):
@@ -59,7 +80,8 @@ class Ulog(Source):
             raise SampleError(f"{self._part}: reading ULog needs pyulog: pip install "
                               "'imu_fusion[devices]'") from None
         try:
-            log = ULog(io.BytesIO(bytes(self._whole.parts.get("", b""))), _WANTED)
+            with contextlib.redirect_stdout(io.StringIO()):    # where it says what is damaged
+                log = ULog(_Bytes(self._whole.parts.get("", b"")), _WANTED)
         except Exception as error:    # of the library: damage shows in any way
             raise SampleError(f"{self._part}: damaged beyond reading ({type(error).__name__}: "
                               f"{error})") from None

@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from imu_fusion.errors import ParameterError
+from imu_fusion.errors import INCOMPLETE, ParameterError
 from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.layouts import FIX, IMU, MAG, TWIST
 from imu_fusion.nodes.base import message_class
@@ -226,7 +226,7 @@ def test_driver_estimator_and_recorder_as_processes(tmp_path, monkeypatch):
             assert time.monotonic() < deadline, nodes.log("driver")
             executor.spin_once(timeout_sec=0.1)
         device.go()
-        assert nodes.process("driver").wait(60.0) == 1    # the device has gone, as it was told
+        assert nodes.process("driver").wait(60.0) == INCOMPLETE    # the device has gone
         assert "the device has closed the connection" in nodes.log("driver")
         executor.shutdown()
         watcher.destroy_node()
@@ -248,4 +248,13 @@ def test_sigint_ends_it_in_every_state(transport):
     assert "driver" in line, line
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=30)
-    assert process.returncode == 0 and "Traceback" not in said, said
+    assert process.returncode == 130 and "Traceback" not in said, said
+
+
+def test_a_device_that_is_not_there_is_one_line_and_an_error():
+    command = [sys.executable, "-m", "imu_fusion.cli", "run", "driver", "--ros-args", "-p",
+               "source:=ubx", "-p", "transport:=tcp://127.0.0.1:9", "-p", "reconnect:=false"]
+    done = subprocess.run(command, env=ENVIRONMENT, cwd=ROOT, capture_output=True, text=True,
+                          timeout=60, check=False)
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.splitlines() == ["driver: tcp://127.0.0.1:9: Connection refused"]

@@ -292,6 +292,18 @@ def test_restarted_under_its_name_it_is_somebody_else(graph):
         f"joined /sender late: {again.input.missed} of its messages had been sent before"]
 
 
+def test_a_session_that_went_on_without_a_sink_is_over_for_it(graph):
+    """As for a process that was stopped for longer than its lease."""
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    sender.session(100, event=None)
+    graph.until(lambda: len(receiver.values) == 100)
+    sender.source.phase = source._LIVE
+    sender.flow.peers.say()
+    graph.until(lambda: receiver.ended)
+    assert receiver.flow.problems == [
+        "the session of /sender broke off: it went on without this node"]
+
+
 def test_two_sinks_of_one_name_get_everything(graph):
     one, two = Receiver(graph), Receiver(graph)
     sender = Sender(graph, wait_for=["receiver"])

@@ -159,6 +159,12 @@ def test_a_node_closes_its_files_when_asked_to_end(tmp_path, monkeypatch, capsys
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 
 
+def test_each_group_of_nodes_has_a_domain_of_its_own(tmp_path):
+    """Also before any of their nodes is seen."""
+    groups = [NodeProcesses(tmp_path) for _ in range(3)]
+    assert len({group.domain for group in groups}) == 3
+
+
 def recorded(path):
     """{topic: number of messages}."""
     with open_bag(path) as reader:

@@ -311,6 +311,14 @@ def test_formats_are_recognised_by_content(tmp_path, name, files, taken):
     assert all((np.diff(log.stamp) >= 0).all() for log in logs.values())
 
 
+def test_a_ulog_that_is_cut_ends(tmp_path):
+    """In its definitions pyulog would step back for ever."""
+    header = b"ULog\x01\x12\x35\x01" + bytes(8)
+    (tmp_path / "cut.ulg").write_bytes(header + b"\xff\xff\x00" + bytes(300))
+    with pytest.raises(ImuFusionError, match=r"cut\.ulg"):
+        open_bag(tmp_path / "cut.ulg")
+
+
 def test_an_archive_that_unpacks_without_end_is_refused(tmp_path):
     (tmp_path / "bomb.zip").write_bytes(zipped({
         "Accelerometer.csv": b'"Time (s)","X (m/s^2)"\n' + b"0" * (1 << 26)}))

@@ -114,8 +114,10 @@ def _rolling(time, rate, params):
     if not len(runs):
         return None
     first = runs[np.argmax(runs[:, 1] - runs[:, 0]), 0]
-    level = float(np.median(rate[first + width // 2:first + width]))
-    reached = first + int(np.argmax(rate[first:] > 0.5 * level))
+    level = float(np.median(rate[first + width:first + 2 * width]))
+    # From here on it stays above half of that: a jerk of the flow does not.
+    slow = np.flatnonzero(rate[first:first + width] < 0.5 * level)
+    reached = first + (int(slow[-1]) + 1 if len(slow) else 0)
     before = float(np.median(rate[max(reached - width, 0):max(reached - width // 4, 1)]))
     marks = []
     for share in (0.5, 0.2):

@@ -15,7 +15,7 @@ from imu_fusion.estimation.smoother.attempt import Attempt, Model
 from imu_fusion.estimation.smoother.gnss_step import find_steps
 from imu_fusion.estimation.smoother.measurements.registry import KINDS
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
-from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, is_many
+from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
@@ -33,11 +33,10 @@ def fits(result: SmootherResult) -> bool:
             and all(size < _LARGE for name, size in result.misfit().items() if name != "mag"))
 
 
-def other_cause(result: SmootherResult) -> bool:
-    """Whether something else is wrong: a surface that the trajectory stands off, or readings in a
-    row beside it. To fit the noise to them would hide it."""
-    return (any(fit.excess > MOST_EXCESS for fit in result.surface.values())
-            or any(is_many(outliers) for outliers in result.outliers().values()))
+def contradicted(result: SmootherResult) -> bool:
+    """Whether a surface is what does not fit. Any other explanation would hide it."""
+    return any(fit.excess > MOST_EXCESS or fit.first_excess > MOST_FIRST_EXCESS
+               for fit in result.surface.values())
 
 
 def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -> SmootherResult:
@@ -46,6 +45,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     Args:
         found: under ``model``. smooth: a model -> its Attempt.
     """
+    if contradicted(found.result):
+        return found.result
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
     scatter = max(1.0, found.result.misfit().get("fix", 1.0))
     for other in _steps(found.result, model, scatter):
@@ -54,8 +55,9 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
                 1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
+    # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
-            or other_cause(found.result)):
+            or any(is_many(outliers) for outliers in found.result.outliers().values())):
         return found.result
     given = model.params.to_mapping()
     for alternatives in (_delays, _velocity_delays, _wandering_velocities, _wandering_fixes,

@@ -16,7 +16,7 @@ _MISFIT = 3.0
 _SINGLE_PASS = 1.3
 MOST_EXCESS = 1.5            # of the deviation from a surface; see smoother_surface_fit
 # Simulated jumps, sunk by 0.3 m: up to 1.4; by 0.7 m, or a fall of 0.4 m: from 2.5.
-_FIRST_EXCESS = 2.0
+MOST_FIRST_EXCESS = 2.0
 _LEAP_SECONDS = 18.0         # s, GPS time ahead of UTC since 2017
 _SILENT = 0.01               # share of the samples
 _OUTLYING = 0.05             # share of the readings
@@ -146,7 +146,7 @@ def _on_surface(result):
         if fit.silent > _SILENT:
             yield (f"the surface ({name}) says nothing at {100 * fit.silent:.0f} % of the samples "
                    "that it should hold: its grid may end there")
-        if fit.first_excess > _FIRST_EXCESS and fit.excess <= MOST_EXCESS and result.jump:
+        if fit.first_excess > MOST_FIRST_EXCESS and fit.excess <= MOST_EXCESS and result.jump:
             yield (f"in the first second the trajectory stands off the surface ({name}) by "
                    f"{fit.first_excess:.1f} times as much as its sigma of {fit.sigma:g} m allows: "
                    "a fall, a deep landing or another touch-down; standard deviations of the "

@@ -20,8 +20,8 @@ processes the session of somebody else). What makes it lossless:
    no names begins when nobody new has been seen for a second.
 4. **The end** is stated, with the counts, when all is acknowledged: then it is in the queue of
    each reader, which takes what there is, compares, finishes, and says so. The sender stays until
-   all have. More or less than the count, a sender that broke off, a joined one that vanished: a
-   *problem*, which is said, and makes the exit code 1 (:attr:`Flow.problems`).
+   all have. More or less than the count, a sender that broke off, one that joined late, left or
+   vanished: a *problem*, which is said, and makes the exit code 3 (:attr:`Flow.problems`).
 
 Who speaks: a state is believed if the graph shows one writer of its topic, always the same, and
 writers of the data that belong to that node. Anything else is ignored with a warning; two writers

@@ -202,7 +202,7 @@ class Sink:
     def follow(self) -> None:
         """Join, and hear how sessions end."""
         for peer in list(self.peers.values()):
-            if peer.state is not None and peer.state.sending.session:
+            if peer.state is not None:
                 self._follow(peer)
         for session in list(self.sessions.values()):
             if session.instance not in self.peers:
@@ -292,7 +292,7 @@ class Sink:
             session.said = said
         elif session is not None and not session.finished:
             if not session.has_ended:
-                self._break(session, "was replaced by another")
+                self._break(session, "went on without this node")
         elif said.event == BEGIN and self.peers.own in said.company and not self._hold():
             self._join(peer, said)
 

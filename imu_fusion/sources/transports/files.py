@@ -59,8 +59,8 @@ def _unpacked(path: Path, most: int | None) -> Iterator[tuple[str, bytes]]:
     size = 0
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = [e for e in archive.infolist() if not e.is_dir()
-                       and Path(e.filename).suffix.lower() in _SUFFIXES]
+            entries = [e for e in archive.infolist()
+                       if Path(e.filename).suffix.lower() in _SUFFIXES]
             for entry in sorted(entries[:_PARTS], key=lambda e: e.filename):
                 with archive.open(entry) as stream:
                     while data := stream.read(PIECE if most is None else most):
@@ -71,5 +71,6 @@ def _unpacked(path: Path, most: int | None) -> Iterator[tuple[str, bytes]]:
                         yield f"{path}/{entry.filename}", data
                         if most is not None:
                             break
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError,
+            IndexError, ValueError) as error:
         raise BagError(f"{path}: an archive that cannot be unpacked ({error})") from None
