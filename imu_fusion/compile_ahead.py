@@ -79,6 +79,7 @@ def _smoother() -> None:
 
 
 def _acceleration_field() -> None:
+    from imu_fusion.geometry.rotation_arrays import rotation_matrices
     from imu_fusion.streams.acceleration_field import FieldConfiguration
 
     imu, _ = _logs()
@@ -92,7 +93,7 @@ def _acceleration_field() -> None:
                         ({"use_gyro": True}, imu.gyr)):
         config = FieldConfiguration.from_mapping(array | values)
         estimator = config.make_estimator()
-        estimator.run(imu.stamp, readings, gyr)
+        rotation_matrices(estimator.run(imu.stamp, readings, gyr)["quat"])
         if values.get("mode") != "smoothed":
             estimator.reset()
             for i in range(_SAMPLES):

@@ -57,12 +57,14 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
     if description is not None:
         refuse_source(description, out)
     with open_bag(source, description) as reader:
-        text = "" if description is None else _array(reader, description)
-        if text:
+        text = ""
+        array = None if description is None else _array(description)
+        if description is not None and array is not None:
             refuse_files([source, description], parameter_file)
             if parameter_file.exists() and not overwrite:
                 raise BagError(f"{parameter_file}: exists already; choose another name or "
                                "--overwrite")
+            text = _parameters(reader, array, Path(description))
         kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
         renamed = {reader.require(other).name: name for name, other in (remap or {}).items()}
         with BagWriter(out, overwrite=overwrite, whole=True) as writer:
@@ -81,16 +83,20 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
                          list(reader.warnings), reader.damaged, reader.format)
 
 
-def _array(reader: Reader, path: str | Path) -> str:
-    """The text of the parameter file; empty without an array."""
+def _array(path: str | Path) -> Description | None:
+    """The description, None where it has no array."""
     content = read_yaml(path)
     if not isinstance(content, dict) or not content.get("accelerometers"):
-        return ""
-    description = Description.from_mapping(content, str(path))
-    topic = f"/{ARRAY_TOPIC}{next(iter(description.array))}"
+        return None
+    return Description.from_mapping(content, str(path))
+
+
+def _parameters(reader: Reader, array: Description, path: Path) -> str:
+    """The text of the parameter file."""
+    topic = f"/{ARRAY_TOPIC}{next(iter(array.array))}"
     stamps = np.array([stamp for _, _, stamp, _ in reader.messages([topic])], dtype=np.int64)
-    return (f"# Made from {reader.path.name} as {Path(path).name} says.\n"
-            + array_parameters(description, stamps, str(path)))
+    return (f"# Made from {reader.path.name} as {path.name} says.\n"
+            + array_parameters(array, stamps, str(path)))
 
 
 def _write(file: Path, text: str, target: Path) -> None:

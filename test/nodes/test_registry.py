@@ -9,6 +9,7 @@ from test.test_registry import node_class
 GIVEN = {
     "replayer": lambda bag, out: {"bag": str(bag), "wait_for_subscribers": 1},
     "recorder": lambda bag, out: {"out": str(out)},
+    "driver": lambda bag, out: {"transport": "udp://127.0.0.1:0", "source": "ximu3"},
     "acceleration_field_estimator": lambda bag, out: {
         "sample_rate": 100.0, "accelerometers.names": ["a", "b", "c", "d"],
         **{f"accelerometers.{name}.position": place for name, place in (

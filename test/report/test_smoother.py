@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion import cli
 from imu_fusion.estimation.smoother import SmootherParams
 from imu_fusion.estimation.smoother.params import Gnss
+from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
@@ -102,8 +103,7 @@ def test_side_view_and_mesh_lie_on_the_profile(smoothed):
 
 def test_fixes_are_compared_at_the_time_and_place_of_the_antenna():
     """East at 10 m/s, nose east; antenna 2 m to the left (north); stamps 100 ms late."""
-    samples = np.zeros(101, [("stamp", "i8"), ("position_world", "f8", 3),
-                             ("quat_world_imu", "f8", 4)])
+    samples = np.zeros(101, SAMPLE)
     samples["stamp"] = np.arange(101) * 10_000_000
     samples["position_world"][:, 0] = np.arange(101) * 0.1
     samples["quat_world_imu"] = Rotation.identity().as_quat()
@@ -116,7 +116,7 @@ def test_fixes_are_compared_at_the_time_and_place_of_the_antenna():
                                atol=1e-9)
     assert np.isnan(smoothed.antenna(np.array([50_000_000]))).all()  # before the first sample
     result.states = {"gnss_time_offset": delay, "gnss_lever_arm": (
-        np.tile([1.0, 0.0, 0.0], (101, 1)), None)}
+        np.tile([1.0, 0.0, 0.0], (101, 1)), np.zeros((101, 3)))}
     np.testing.assert_allclose(smoothed.antenna(np.array([500_000_000])), [[5.0, 0.0, 0.0]],
                                atol=1e-9)
     # Stamps beyond the 53 bits of a float.

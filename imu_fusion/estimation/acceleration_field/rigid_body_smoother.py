@@ -72,7 +72,8 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
         # small numbers keeps the digits that a wide prior would cost.
         smoothed[n] = trace.x[n] - (trace.cov[n] @ vector)[:, 0]
         part = np.ascontiguousarray(trace.cov[n][:BIAS])
-        smoothed_cov[n] = part[:, :BIAS] - part @ information @ part.T
+        found = part[:, :BIAS] - part @ information @ part.T
+        smoothed_cov[n] = 0.5 * (found + found.T)
         _before_update(adjoint, touched, trace, n)
         if trace.dt[n] < 0.0:
             # Across a gap, only attitude, omega and biases are the same state.
