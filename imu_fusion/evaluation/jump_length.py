@@ -24,4 +24,3 @@ class JumpLengths:
         """RMS of the errors, m (Fang et al. 2020, section 4.2); with the greatest error (m) that a
         measured length may have, the most that it can be."""
         return float(np.sqrt(np.mean((np.abs(self.error) + measuring_error) ** 2)))
-

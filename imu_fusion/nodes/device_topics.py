@@ -91,5 +91,3 @@ class DeviceTopic:
                 self._usual = float(np.median(self._intervals))
         else:
             self.gaps += int((step > _GAP * self._usual).sum())
-
-

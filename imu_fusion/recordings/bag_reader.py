@@ -246,10 +246,10 @@ class Reader:
                     data = unpacked
                 if topic in asked:
                     yield topic, self.topics[topic].msgtype, log_time, data
-                for name, (holder, field) in fields.items():
+                for name, (holder, nested) in fields.items():
                     if holder == topic:
                         try:
-                            yield name, field.msgtype, log_time, field.extract(data)
+                            yield name, nested.msgtype, log_time, nested.extract(data)
                         except MessageError as error:
                             self.lose(f"{name}: messages cannot be decoded and are left out "
                                       f"({error})")

@@ -135,6 +135,7 @@ _SENSORS: dict[str, type[Parameters]] = {
 _TOPICS = {"accelerometer": IMU_TOPIC, "gyroscope": IMU_TOPIC, "magnetometer": MAG_TOPIC,
            "position": FIX_TOPIC, "velocity": VELOCITY_TOPIC, "reference": REFERENCE_TOPIC}
 
+
 @dataclass(frozen=True)
 class Description:
     """A table: how it is written, its sensors by name of the key, those of an array by their name
