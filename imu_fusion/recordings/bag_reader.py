@@ -246,10 +246,10 @@ class Reader:
                     data = unpacked
                 if topic in asked:
                     yield topic, self.topics[topic].msgtype, log_time, data
-                for name, (holder, nested) in fields.items():
+                for name, (holder, member) in fields.items():
                     if holder == topic:
                         try:
-                            yield name, nested.msgtype, log_time, nested.extract(data)
+                            yield name, member.msgtype, log_time, member.extract(data)
                         except MessageError as error:
                             self.lose(f"{name}: messages cannot be decoded and are left out "
                                       f"({error})")

@@ -145,8 +145,7 @@ def spread(turns: np.ndarray, vectors: np.ndarray, with_bias: bool = False) -> n
 
 
 def gravity_verdict(imu: ImuLog) -> Verdict:
-    """Whether gravity turns as the gyroscope says; ``axes`` of the verdict are those of the rates.
-    """
+    """Whether gravity turns as the gyroscope says; ``axes`` of the verdict are the rates'."""
     windows = Windows(imu.stamp, imu.gyr, imu.acc, _GRAVITY)
     if len(windows) < _FEWEST:
         return Verdict("unknown")

@@ -116,8 +116,7 @@ def prepare(fit, design, used, max_condition):
 
 @njit
 def _worst(fit, work):
-    """Largest square of what the fit leaves over, in units of its variance; ``work.left`` gets it.
-    """
+    """Largest square of what the fit leaves, in units of its variance; ``work.left`` gets it."""
     worst = 0.0
     m = len(work.left)
     for c in range(m):
