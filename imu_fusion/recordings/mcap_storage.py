@@ -8,57 +8,48 @@ searched for; a chunk is checked when it is unpacked, and left out if its bytes 
 import contextlib
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from imu_fusion.errors import BagError
+from imu_fusion.recordings.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    HEAD,
+    INDEX,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    SCHEMA,
+    SEARCH,
+    Channel,
+    Schema,
+    define,
+    end_of,
+    find_record,
+    is_followed,
+    records,
+)
 from imu_fusion.recordings.qos import read_profiles
 from imu_fusion.recordings.storage import (
     DamageError,
+    FileStorage,
     Part,
     Row,
-    Storage,
     StoredTopic,
-    Window,
     in_order,
     span,
     unpack,
 )
 
-MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _DATA_END = 2, 3, 4, 5, 6, 7, 15
-_LAST = 15                 # opcode of the specification
-_PRIVATE = 128             # and beyond: of others, may be stepped over
-# Least and greatest length of each record; the lengths inside of it must add up besides.
-_LENGTHS = {1: (8, 1 << 20), 2: (20, 20), 3: (14, 1 << 26), 4: (16, 1 << 26), 5: (22, 1 << 62),
-            6: (40, 1 << 62), 7: (6, 1 << 40), 8: (64, 1 << 30), 9: (36, 1 << 62),
-            10: (44, 1 << 30), 11: (42, 1 << 30), 12: (8, 1 << 30), 13: (20, 1 << 30),
-            14: (17, 17), 15: (4, 4)}
-_HEAD = struct.Struct("<BQ")
-_CHUNK_HEAD = struct.Struct("<QQQII")
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-_AGREE = 3                 # records in a row that are not there by chance
-_SEARCH = 1 << 20
 _TOGETHER = 1 << 20        # bytes of records outside of chunks that are read at once
 _TRIES = 3                 # chunks that are unpacked in search of a channel
-
-
-class _Channel(NamedTuple):
-    schema: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str]
-
-
-class _Schema(NamedTuple):
-    name: str
-    encoding: str
-    data: bytes
 
 
 @dataclass
@@ -80,34 +71,24 @@ class _Block:
         self.last = last if self.last is None else max(self.last, last)
 
 
-class McapStorage(Storage):
+class McapStorage(FileStorage):
     """See :class:`imu_fusion.recordings.storage.Storage`."""
 
-    def __init__(self, path: Path, lose: Callable[[str], object],
-                 mention: Callable[[str], object]) -> None:
-        super().__init__(path, lose, mention)
-        self._file = Window(path)
+    def _open(self) -> None:
         self._blocks: list[_Block] = []
-        self._channels: dict[int, _Channel] = {}
-        self._schemas: dict[int, _Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, Schema] = {}
         # Those of the index: good as long as its checksum says so.
-        self._index: tuple[dict[int, _Channel], dict[int, _Schema]] = {}, {}
+        self._index: tuple[dict[int, Channel], dict[int, Schema]] = {}, {}
         self._in_index = False
         self._holes: list[tuple[int, int, _Block]] = []   # (bytes, number of the block after, lost)
         self._lost: _Block | None = None    # a chunk that is no more, though its index may be
-        try:
-            self._walk()
-            self._learn_channels()
-            self._make_topics()
-            self._tell_holes()
-            if not self._blocks and not self._channels and self._file.read(0, 8) != MAGIC:
-                raise BagError(f"{path}: not an MCAP file, or damaged beyond reading")
-        except BaseException:
-            self._file.close()
-            raise
-
-    def close(self) -> None:
-        self._file.close()
+        self._walk()
+        self._learn_channels()
+        self._make_topics()
+        self._tell_holes()
+        if not self._blocks and not self._channels and self._file.read(0, 8) != MAGIC:
+            raise BagError(f"{self.path}: not an MCAP file, or damaged beyond reading")
 
     def messages(self, topics: Collection[str], start: int | None,
                  stop: int | None) -> Iterator[Row]:
@@ -130,8 +111,8 @@ class McapStorage(Storage):
         while position < size:
             if size - position == len(MAGIC) and self._file.read(position, 8) == MAGIC:
                 return
-            end = self._end_of(position)
-            if end is None or not self._is_followed(position, end):
+            end = end_of(self._file, position)
+            if end is None or not is_followed(self._file, position, end):
                 position = self._resume(position)
                 continue
             self._take(position, end)
@@ -146,7 +127,7 @@ class McapStorage(Storage):
             # The chunk before it is shorter than it says: bytes are missing in it.
             self._blocks.pop()
             position = start = block.position
-        found = self._find(start)
+        found = find_record(self._file, start)
         if self._in_index:
             self.mention(f"{self.path.name}: not closed properly: its index is damaged or cut off; "
                          "it is read without")
@@ -162,114 +143,35 @@ class McapStorage(Storage):
             return False
         return bool(block.crc)
 
-    def _end_of(self, position: int) -> int | None:
-        """Where the record at ``position`` ends, None if there is none."""
-        head = self._file.read(position, _HEAD.size)
-        if len(head) < _HEAD.size:
-            return None
-        opcode, length = _HEAD.unpack(head)
-        if opcode == 0 or _LAST < opcode < _PRIVATE:
-            return None
-        end = position + _HEAD.size + length
-        low, high = _LENGTHS.get(opcode, (0, 1 << 40))
-        if not low <= length <= high or end > self._file.size:
-            return None
-        return end if self._adds_up(opcode, position + _HEAD.size, length) else None
-
-    def _adds_up(self, opcode: int, position: int, length: int) -> bool:
-        """Whether the lengths inside of a record make its own."""
-        if opcode == _CHUNK:
-            head = self._file.read(position, 72)
-            (text,) = struct.unpack_from("<I", head, 28)
-            if text > 32:
-                return False
-            (records,) = struct.unpack_from("<Q", head, 32 + text)
-            return length == 40 + text + records
-        if opcode == _INDEX:
-            (entries,) = struct.unpack("<I", self._file.read(position + 2, 4))
-            return length == 6 + entries and entries % 16 == 0
-        if opcode in (_SCHEMA, _CHANNEL):
-            try:
-                content = self._file.read(position, length)
-                (_schema if opcode == _SCHEMA else _channel)(content)
-            except DamageError:
-                return False
-        return True
-
-    def _is_followed(self, position: int, end: int) -> bool:
-        """Whether a message outside of chunks, which nothing else vouches for, ends where another
-        record begins, or the file does."""
-        if self._file.read(position, 1)[0] != _MESSAGE or end == self._file.size:
-            return True
-        if self._end_of(end) is not None:
-            return True
-        head = self._file.read(end, _HEAD.size)
-        if len(head) < _HEAD.size:
-            return 0 < head[0] <= _LAST
-        opcode, length = _HEAD.unpack(head)
-        return (0 < opcode <= _LAST and length < 1 << 32
-                and end + _HEAD.size + length > self._file.size)   # the cut end of a file
-
-    def _find(self, start: int) -> int:
-        """Position of the first record at or after ``start``, the size of the file without one."""
-        while start < self._file.size - _HEAD.size:
-            data = self._file.read(start, _SEARCH)
-            bytes_ = np.frombuffer(data, np.uint8)
-            count = len(bytes_) - _HEAD.size + 1
-            opcode = bytes_[:count]
-            length = np.lib.stride_tricks.sliding_window_view(bytes_[1:], 8)[:count]
-            # The length fits into a file: its upper bytes are zero.
-            places = np.flatnonzero((opcode > 0) & (opcode <= _LAST)
-                                    & (length[:, 5:] == 0).all(axis=1))
-            for place in places.tolist():
-                if self._is_record(start + place):
-                    return start + place
-            start += count
-        return self._file.size
-
-    def _is_record(self, position: int) -> bool:
-        """Whether enough records follow from ``position`` on not to be chance."""
-        opcode = self._file.read(position, 1)[0]
-        for _ in range(_AGREE):
-            end = self._end_of(position)
-            if end is None:
-                return False
-            if opcode == _CHUNK or end == self._file.size:
-                return True
-            position = end
-            if self._file.size - position == len(MAGIC):
-                return self._file.read(position, 8) == MAGIC
-        return True
-
     # What the records say.
 
     def _take(self, position: int, end: int) -> None:
         opcode = self._file.read(position, 1)[0]
-        content = position + _HEAD.size
-        if opcode in (_CHUNK, _MESSAGE):
+        content = position + HEAD.size
+        if opcode in (CHUNK, MESSAGE):
             self._lost = None
-        if opcode == _CHUNK:
+        if opcode == CHUNK:
             self._take_chunk(content, end)
-        elif opcode == _INDEX:
+        elif opcode == INDEX:
             self._take_index(self._file.read(content, end - content))
-        elif opcode == _MESSAGE:
-            number, _, log_time, _ = _MESSAGE_HEAD.unpack(
-                self._file.read(content, _MESSAGE_HEAD.size))
+        elif opcode == MESSAGE:
+            number, _, log_time, _ = MESSAGE_HEAD.unpack(
+                self._file.read(content, MESSAGE_HEAD.size))
             block = self._open_run(position)
             block.size = block.unpacked = end - block.position
             block.counts[number] = block.counts.get(number, 0) + 1
             block.saw(log_time, log_time)
-        elif opcode in (_SCHEMA, _CHANNEL):
+        elif opcode in (SCHEMA, CHANNEL):
             channels, schemas = self._index if self._in_index else (self._channels, self._schemas)
-            _define(opcode, self._file.read(content, end - content), channels, schemas)
-        elif opcode == _DATA_END:
+            define(opcode, self._file.read(content, end - content), channels, schemas)
+        elif opcode == DATA_END:
             self._in_index = True
-        elif opcode == _FOOTER:
+        elif opcode == FOOTER:
             self._check_index(position, self._file.read(content, 20))
 
     def _take_chunk(self, content: int, end: int) -> None:
         head = self._file.read(content, 72)
-        first, last, unpacked, crc, text = _CHUNK_HEAD.unpack_from(head)
+        first, last, unpacked, crc, text = CHUNK_HEAD.unpack_from(head)
         compression = head[32:32 + text].decode("ascii", "replace")
         start = content + 40 + text
         self._blocks.append(_Block(start, end - start, unpacked, compression, crc,
@@ -301,9 +203,9 @@ class McapStorage(Storage):
         start, _, crc = struct.unpack("<QQI", footer)
         if not crc or not 0 < start <= position:
             return
-        value, size = 0, position + _HEAD.size + 16 - start
-        for offset in range(0, size, _SEARCH):
-            value = zlib.crc32(self._file.read(start + offset, min(_SEARCH, size - offset)), value)
+        value, size = 0, position + HEAD.size + 16 - start
+        for offset in range(0, size, SEARCH):
+            value = zlib.crc32(self._file.read(start + offset, min(SEARCH, size - offset)), value)
         if value != crc:
             self._index = {}, {}
             self.mention(f"{self.path.name}: its index is damaged; it is read without")
@@ -332,16 +234,16 @@ class McapStorage(Storage):
                 data = self._file.read(block.position, block.size)    # definitions may be sound
             for number in unknown:
                 tries[number] = tries.get(number, 0) + 1
-            for opcode, content in _records(data):
-                if opcode in (_SCHEMA, _CHANNEL):
+            for opcode, content in records(data):
+                if opcode in (SCHEMA, CHANNEL):
                     with contextlib.suppress(DamageError):
-                        _define(opcode, content, self._channels, self._schemas)
-                elif opcode == _MESSAGE and not counted and len(content) >= _MESSAGE_HEAD.size:
-                    number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
+                        define(opcode, content, self._channels, self._schemas)
+                elif opcode == MESSAGE and not counted and len(content) >= MESSAGE_HEAD.size:
+                    number, _, log_time, _ = MESSAGE_HEAD.unpack_from(content)
                     block.counts[number] = block.counts.get(number, 0) + 1
                     block.saw(log_time, log_time)
 
-    def _type_of(self, channel: _Channel) -> str:
+    def _type_of(self, channel: Channel) -> str:
         """The message type of a channel; empty, if it is no topic of ROS 2."""
         schema = self._schemas.get(channel.schema)
         known = schema is not None and channel.encoding == "cdr" and channel.topic
@@ -428,82 +330,13 @@ class McapStorage(Storage):
             self._lose_chunk(block, error)
             return iter(())
         rows = []
-        for opcode, content in _records(data):
-            if opcode != _MESSAGE or len(content) < _MESSAGE_HEAD.size:
+        for opcode, content in records(data):
+            if opcode != MESSAGE or len(content) < MESSAGE_HEAD.size:
                 continue
-            number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
+            number, _, log_time, _ = MESSAGE_HEAD.unpack_from(content)
             topic = wanted.get(number)
             if topic is not None and (start is None or log_time >= start) and (
                     stop is None or log_time < stop):
-                rows.append((log_time, topic, bytes(content[_MESSAGE_HEAD.size:])))
+                rows.append((log_time, topic, bytes(content[MESSAGE_HEAD.size:])))
         rows.sort(key=lambda row: row[0])
         return iter(rows)
-
-
-def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of the records of a chunk, as far as their lengths fit."""
-    view, position = memoryview(data), 0
-    while position + _HEAD.size <= len(data):
-        opcode, length = _HEAD.unpack_from(data, position)
-        position += _HEAD.size
-        if length > len(data) - position:
-            return
-        yield opcode, view[position:position + length]
-        position += length
-
-
-def _define(opcode: int, content: bytes | memoryview, channels: dict[int, _Channel],
-            schemas: dict[int, _Schema]) -> None:
-    if opcode == _SCHEMA:
-        number, schema = _schema(content)
-        schemas[number] = schema
-    else:
-        number, channel = _channel(content)
-        channels[number] = channel
-
-
-def _schema(content: bytes | memoryview) -> tuple[int, _Schema]:
-    reader = _Strings(content, 2)
-    schema = _Schema(reader.text(), reader.text(), reader.take())
-    reader.end()
-    return struct.unpack_from("<H", content)[0], schema
-
-
-def _channel(content: bytes | memoryview) -> tuple[int, _Channel]:
-    reader = _Strings(content, 4)
-    topic, encoding = reader.text(), reader.text()
-    entries = _Strings(reader.take(), 0)
-    metadata = {}
-    while entries.left():
-        key = entries.text()
-        metadata[key] = entries.text()
-    reader.end()
-    number, schema = struct.unpack_from("<HH", content)
-    return number, _Channel(schema, topic, encoding, metadata)
-
-
-class _Strings:
-    """Bytes with their length ahead of them, one after the other."""
-
-    def __init__(self, data: bytes | memoryview, position: int) -> None:
-        self._data, self._position = bytes(data), position
-
-    def left(self) -> bool:
-        return self._position < len(self._data)
-
-    def take(self) -> bytes:
-        start = self._position + 4
-        if start > len(self._data):
-            raise DamageError("a length is missing")
-        (length,) = struct.unpack_from("<I", self._data, self._position)
-        self._position = start + length
-        if self._position > len(self._data):
-            raise DamageError("a length is beyond the record")
-        return self._data[start:self._position]
-
-    def text(self) -> str:
-        return self.take().decode("utf-8", "replace")
-
-    def end(self) -> None:
-        if self.left():
-            raise DamageError("lengths do not add up")

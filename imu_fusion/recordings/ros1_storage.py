@@ -8,10 +8,9 @@ import bz2
 import keyword
 import re
 import struct
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from pathlib import Path
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
@@ -22,9 +21,9 @@ from imu_fusion.messages.typestore import TYPES
 from imu_fusion.recordings.qos import qos_profile
 from imu_fusion.recordings.storage import (
     DamageError,
+    FileStorage,
     Part,
     Row,
-    Storage,
     StoredTopic,
     Window,
     in_order,
@@ -62,35 +61,26 @@ class _Connection:
     latching: bool
 
 
-class Ros1Storage(Storage):
+class Ros1Storage(FileStorage):
     """See :class:`imu_fusion.recordings.storage.Storage`."""
 
-    def __init__(self, path: Path, lose: Callable[[str], object],
-                 mention: Callable[[str], object]) -> None:
-        super().__init__(path, lose, mention)
-        self._file = Window(path)
+    def _open(self) -> None:
         self._chunks: list[_Chunk] = []
         self._connections: dict[int, _Connection] = {}
         self._stores: dict[str, Typestore] = {}
         self._broken: dict[str, int] = {}
         self._holes: list[tuple[int, int]] = []    # (bytes, number of the chunk after)
         self._lost = False    # a chunk, though its index may still be there
-        try:
-            if self._file.read(0, len(MAGIC)) != MAGIC:
-                raise BagError(f"{path}: not a ROS 1 bag of format 2.0 (it does not begin with "
-                               f"{MAGIC.decode().strip()}); rosbag migrate converts older ones")
-            self._walk()
-            self._count()
-            self._make_topics()
-            self._tell_holes()
-            if not self._chunks:
-                self.lose(f"{path.name}: holds no chunk: nothing was written, or the rest is lost")
-        except BaseException:
-            self._file.close()
-            raise
-
-    def close(self) -> None:
-        self._file.close()
+        if self._file.read(0, len(MAGIC)) != MAGIC:
+            raise BagError(f"{self.path}: not a ROS 1 bag of format 2.0 (it does not begin with "
+                           f"{MAGIC.decode().strip()}); rosbag migrate converts older ones")
+        self._walk()
+        self._count()
+        self._make_topics()
+        self._tell_holes()
+        if not self._chunks:
+            self.lose(f"{self.path.name}: holds no chunk: nothing was written, or the rest is "
+                      "lost")
 
     def messages(self, topics: Collection[str], start: int | None,
                  stop: int | None) -> Iterator[Row]:

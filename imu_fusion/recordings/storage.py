@@ -92,6 +92,27 @@ class Window:
         self._file.close()
 
 
+class FileStorage(Storage):
+    """A Storage that is read through a :class:`Window`, which is closed if it cannot be opened."""
+
+    def __init__(self, path: Path, lose: Callable[[str], object],
+                 mention: Callable[[str], object]) -> None:
+        super().__init__(path, lose, mention)
+        self._file = Window(path)
+        try:
+            self._open()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _open(self) -> None:
+        """Find what the file holds."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self._file.close()
+
+
 def largest_chunk() -> int:
     """Bytes that a chunk, or a message, may take when unpacked."""
     text = os.environ.get(LIMIT_VARIABLE, "")

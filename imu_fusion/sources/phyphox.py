@@ -36,7 +36,7 @@ from imu_fusion.sources.source import (
     VELOCITY_TOPIC,
     Block,
     Source,
-    Whole,
+    WholeSource,
     named,
 )
 from imu_fusion.sources.table import UNKNOWN_CLIMB_SD, Rows, TableReader
@@ -92,19 +92,11 @@ def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
     return named({FIX_TOPIC: fixes, VELOCITY_TOPIC: VelocityLog(stamp, vel, cov)[moves]})
 
 
-class PhyphoxExport(Source):
+class PhyphoxExport(WholeSource):
     """A folder, archive or Excel file."""
 
-    def __init__(self, strict: bool = True) -> None:
-        super().__init__(strict)
-        self._whole = Whole()
-
-    def feed(self, data: bytes, part: str = "") -> list[Block]:
-        self._whole.add(part, data)
-        return []
-
     def finish(self) -> list[Block]:
-        sheets = dict(_sheets(self._whole.parts))
+        sheets = dict(_sheets(self.parts))
         clock = _clock(sheets.pop("time", None))
         if clock is None:
             self.remark("the export has no meta/time.csv: stamps begin at an arbitrary instant")

@@ -30,7 +30,7 @@ from imu_fusion.sources.source import (
     VELOCITY_TOPIC,
     Block,
     Source,
-    Whole,
+    WholeSource,
     named,
 )
 from imu_fusion.sources.table import UNKNOWN_CLIMB_SD, TableReader
@@ -44,7 +44,7 @@ _BATCHES = 5          # that may be overtaken
 _LARGEST = 1 << 24    # bytes of one batch
 
 
-class SensorLoggerExport(Source):
+class SensorLoggerExport(WholeSource):
     """A folder or archive.
 
     Args:
@@ -53,15 +53,11 @@ class SensorLoggerExport(Source):
 
     def __init__(self, strict: bool = True, platform: str | None = None) -> None:
         super().__init__(strict)
-        self._whole, self._platform = Whole(), platform
-
-    def feed(self, data: bytes, part: str = "") -> list[Block]:
-        self._whole.add(part, data)
-        return []
+        self._platform = platform
 
     def finish(self) -> list[Block]:
         tables = {PurePosixPath(part).stem.lower(): (part, bytes(data))
-                  for part, data in self._whole.parts.items()
+                  for part, data in self.parts.items()
                   if PurePosixPath(part).suffix.lower() == ".csv"}
         meta = _metadata(*tables.get("metadata", ("", b"")))
         self.device = meta.get("device name", "")[:80]
@@ -98,7 +94,7 @@ class SensorLoggerExport(Source):
         if not set(vectors) & {"accelerometer", "gravity", "totalacceleration",
                                "accelerometeruncalibrated"}:
             return 1.0, 1.0
-        folder = str(PurePosixPath(next(iter(self._whole.parts))).parent)
+        folder = str(PurePosixPath(next(iter(self.parts))).parent)
         raise SampleError(f"{folder}: Metadata.csv does not tell the platform, and with it the "
                           "sign of accelerations: put the file of the export back, or give a "
                           "description with 'platform: android' or 'platform: ios'")

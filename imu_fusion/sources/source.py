@@ -121,20 +121,21 @@ class Lines:
         return self._number, line.rstrip(b"\r").decode("utf-8", "replace")
 
 
-class Whole:
-    """Collects the bytes of a format that can only be read as a whole."""
+class WholeSource(Source):
+    """A format that can only be read as a whole: :meth:`finish` makes the samples of ``parts``."""
 
-    def __init__(self) -> None:
+    def __init__(self, strict: bool = True) -> None:
+        super().__init__(strict)
         self.parts: dict[str, bytearray] = {}
         self._size = 0
 
-    def add(self, part: str, data: bytes) -> None:
-        """More bytes of a part."""
+    def feed(self, data: bytes, part: str = "") -> list[Block]:
         self._size += len(data)
         if self._size > LARGEST_WHOLE:
             raise SampleError(f"{part}: more than {LARGEST_WHOLE >> 20} MB, which this format "
                               "would need in memory at once")
         self.parts.setdefault(part, bytearray()).extend(data)
+        return []
 
 
 def numbers(where: str, name: str, lines: list[int], texts: list[str]) -> np.ndarray:

@@ -3,24 +3,16 @@
 from imu_fusion.errors import SampleError
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.sketch import sketch
-from imu_fusion.sources.source import Block, Source, Whole
+from imu_fusion.sources.source import Block, WholeSource
 from imu_fusion.sources.table import TableSource
 
 
-class Tables(Source):
+class Tables(WholeSource):
     """A table, or those of a folder that tell what they hold; others are named and left out."""
-
-    def __init__(self, strict: bool = True) -> None:
-        super().__init__(strict)
-        self._whole = Whole()
-
-    def feed(self, data: bytes, part: str = "") -> list[Block]:
-        self._whole.add(part, data)
-        return []
 
     def finish(self) -> list[Block]:
         blocks: list[Block] = []
-        for part, data in self._whole.parts.items():
+        for part, data in self.parts.items():
             try:
                 found = sketch(bytes(data), part)
             except SampleError:

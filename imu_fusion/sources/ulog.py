@@ -24,8 +24,7 @@ from imu_fusion.sources.source import (
     NO_FIX,
     VELOCITY_TOPIC,
     Block,
-    Source,
-    Whole,
+    WholeSource,
     named,
 )
 
@@ -60,30 +59,21 @@ class _Bytes(io.BytesIO):
         return data
 
 
-class Ulog(Source):
+class Ulog(WholeSource):
     """A whole log."""
 
-    def __init__(self, strict: bool = True) -> None:
-        super().__init__(strict)
-        self._whole = Whole()
-        self._part = ""
-
-    def feed(self, data: bytes, part: str = "") -> list[Block]:
-        self._part = part
-        self._whole.add("", data)
-        return []
-
     def finish(self) -> list[Block]:
+        part, data = next(iter(self.parts.items()), ("", bytearray()))
         try:
             from pyulog import ULog
         except ImportError:
-            raise SampleError(f"{self._part}: reading ULog needs pyulog: pip install "
+            raise SampleError(f"{part}: reading ULog needs pyulog: pip install "
                               "'imu_fusion[devices]'") from None
         try:
             with contextlib.redirect_stdout(io.StringIO()):    # where it says what is damaged
-                log = ULog(_Bytes(self._whole.parts.get("", b"")), _WANTED)
+                log = ULog(_Bytes(data), _WANTED)
         except Exception as error:    # of the library: damage shows in any way
-            raise SampleError(f"{self._part}: damaged beyond reading ({type(error).__name__}: "
+            raise SampleError(f"{part}: damaged beyond reading ({type(error).__name__}: "
                               f"{error})") from None
         if log.file_corruption:
             self.lost["parts of the log that are damaged"] += 1
@@ -95,7 +85,10 @@ class Ulog(Source):
         for dataset in log.data_list:
             if len(dataset.data.get("timestamp", ())):
                 sets.setdefault(dataset.name, dataset.data)
-        return self._blocks(sets)
+        blocks = self._blocks(sets)
+        if not blocks:
+            raise SampleError(f"{part}: none of {', '.join(_WANTED)} was logged")
+        return blocks
 
     def _blocks(self, sets: dict[str, dict[str, np.ndarray]]) -> list[Block]:
         gps = sets.get("vehicle_gps_position") or sets.get("sensor_gps")
@@ -131,8 +124,6 @@ class Ulog(Source):
             body = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])    # half a turn about forward
             found = (_ENU_NED * Rotation.from_quat(quat[fine]) * body).as_quat()
             blocks += named({ONBOARD_TOPIC: PoseLog(stamp, found, np.zeros((len(stamp), 3)))})
-        if not blocks:
-            raise SampleError(f"{self._part}: none of {', '.join(_WANTED)} was logged")
         return blocks
 
     def _zero(self, gps: dict[str, np.ndarray] | None) -> int:

@@ -28,7 +28,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.recordings.mcap_storage import MAGIC
+from imu_fusion.recordings.mcap_records import MAGIC
 from imu_fusion.recordings.repair import repair
 from test.recordings.test_bag import START, STEP, imu, write
 

@@ -21,7 +21,7 @@ from imu_fusion.estimation.smoother.result import SmootherResult
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
-
+_FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _WHITE = 0.3         # of the stated noise that is left white where the rest wanders
 
 
@@ -30,7 +30,8 @@ def fits(result: SmootherResult) -> bool:
     ones are no reason: what is stated then is too cautious, and not wrong. A magnetometer's are
     none: iron is no noise."""
     return (all(excess == 1.0 for name, excess in result.wander.items() if name != "mag")
-            and all(size < _LARGE for name, size in result.misfit().items() if name != "mag"))
+            and all(size < _LARGE or len(result.innovations[name][0]) < _FEWEST
+                    for name, size in result.misfit().items() if name != "mag"))
 
 
 def contradicted(result: SmootherResult) -> bool:
@@ -50,9 +51,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
     scatter = max(1.0, found.result.misfit().get("fix", 1.0))
     for other in _steps(found.result, model, scatter):
-        tried = smooth(other)
-        if _gain(tried, found) > _GAIN * scatter ** 2 and _left(tried.result) <= max(
-                1.0, _LEFT * _left(found.result)):
+        tried, chosen = _try(found, model, other, smooth, _GAIN * scatter ** 2)
+        if chosen is other and _left(tried.result) <= max(1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
     # Readings in a row far beside the trajectory are no noise either.
@@ -109,13 +109,14 @@ def _where_zero(model, changes):
         yield model.changed(changes)
 
 
-def _try(found, model, other, smooth):
-    """The other model and its attempt if it is so much likelier, else those found."""
+def _try(found, model, other, smooth, gain=_GAIN):
+    """The attempt and model that are likelier by a gain, else those found."""
     try:
         tried = smooth(other)
     except EstimationError:
         return found, model
-    return (tried, other) if _gain(tried, found) > _GAIN else (found, model)
+    gained = tried.result.log_likelihood - found.result.log_likelihood
+    return (tried, other) if gained > gain else (found, model)
 
 
 def _steps(result: SmootherResult, model: Model, scatter: float) -> Iterator[Model]:
@@ -124,10 +125,6 @@ def _steps(result: SmootherResult, model: Model, scatter: float) -> Iterator[Mod
         for at in find_steps(result.innovations["fix"][0], result.residuals["fix"] / scatter,
                              result.wander["fix"] == 1.0):
             yield model._replace(step_at=at)
-
-
-def _gain(tried: Attempt, found: Attempt) -> float:
-    return tried.result.log_likelihood - found.result.log_likelihood
 
 
 def _left(result: SmootherResult) -> float:
