@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 from imu_fusion.report import figures as fig
 from imu_fusion.report.field_data import FieldData
 from imu_fusion.report.figures import Band, Line, Panel, time_figure
-from imu_fusion.report.html import Figure, Number, Numbers, Section, Table, Text
+from imu_fusion.report.html import Figure, Notes, Number, Numbers, Section, Table, Text
 from imu_fusion.report.overview import number
 from imu_fusion.samples import seconds
 
@@ -72,7 +72,9 @@ def _field(data, time):
              "As a vector in the world it shares the uncertainty of the orientation, which turns "
              "it and hardly changes its magnitude.")
     rate, turning = (np.linalg.norm(data.rows[name], axis=1).max() for name in ("omega", "alpha"))
+    doubts = (Notes(data.remarks),) if data.remarks else ()
     return Section("Acceleration field", (
+        *doubts,
         Numbers((Number("Samples", str(len(time))),
                  Number("Peak acceleration", f"{magnitude.max():.1f} m/s²",
                         "kinematic, all points"),

@@ -31,6 +31,7 @@ class FieldData:
 
     ``readings`` maps accelerometers to (n, 3) m/s^2 in their own axes, NaN where there is none;
     ``gyr`` (n, 3) rad/s of the gyroscope in body axes, NaN where there is none, or None.
+    ``impacts`` and ``remarks``: what ``process`` has found beside the estimates.
     """
 
     rows: np.ndarray
@@ -38,6 +39,7 @@ class FieldData:
     readings: dict
     gyr: np.ndarray | None
     impacts: list
+    remarks: tuple[str, ...] = ()
 
     @property
     def points(self) -> np.ndarray:
@@ -106,7 +108,14 @@ def read_field(bag: str | Path, estimates: str | Path,
         if limit is not None:
             with np.errstate(invalid="ignore"):
                 rows["flags"][(np.abs(reading) >= limit).any(axis=1)] |= SATURATED
-    return FieldData(rows, config, readings, gyr, _impacts(estimates, params_file, config, rows))
+    found = read_results(estimates)
+    beside = {} if found is None else found.get(NODE, {})
+    if found is None and params_file is not None:
+        impacts = measure_impacts(rows, config.field.points, config.field.gravity,
+                                  config.stream.impact)
+    else:
+        impacts = beside.get("impacts", [])
+    return FieldData(rows, config, readings, gyr, impacts, tuple(beside.get("remarks", ())))
 
 
 def _messages(reader, topic):
@@ -163,13 +172,3 @@ def _at(stamps, log_stamps, values, tolerance):
     known[known] &= log_stamps[order][place[known]] - stamps[known] <= tolerance
     result[known] = values[order[place[known]]]
     return result
-
-
-def _impacts(estimates, params_file, config, rows):
-    """Metrics that ``process`` has written beside the estimates, or of the rows."""
-    found = read_results(estimates)
-    if found is not None:
-        return found.get(NODE, {}).get("impacts", [])
-    if params_file is None:
-        return []
-    return measure_impacts(rows, config.field.points, config.field.gravity, config.stream.impact)

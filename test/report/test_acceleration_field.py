@@ -1,6 +1,7 @@
 """The field in the report: magnitudes, residuals and clipping of a motion known exactly."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.results import write_results
 from imu_fusion.report.acceleration_field import field_picture, field_sections
 from imu_fusion.report.field_data import read_field
+from imu_fusion.report.html import Notes
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.streams.acceleration_field import ACCEL_TOPIC, IMU_TOPIC
 from test.report.test_report import EVIL, START, Page
@@ -101,6 +104,16 @@ def test_residuals_are_the_biases_in_the_axes_of_the_sensor(data):
 def test_clipping_is_told_per_axis_from_the_recorded_rate(data):
     assert not data.clipped[:, :2].any()
     assert data.clipped[:, 2].tolist() == [ALPHA * i / RATE >= LIMIT for i in range(600)]
+
+
+def test_what_makes_the_field_doubtful_stands_above_it(data, recording, tmp_path):
+    assert not any(isinstance(b, Notes) for b in field_sections(data, START)[0].blocks)
+    bag, params = recording
+    shutil.copytree(bag, tmp_path / "bag")
+    text = "accelerometer 'b' contradicts the others"
+    write_results(tmp_path / "bag", {"acceleration_field_estimator": {"remarks": [text]}})
+    noted = read_field(bag, tmp_path / "bag", params)
+    assert field_sections(noted, START)[0].blocks[0] == Notes((text,))
 
 
 def test_the_event_has_its_metrics_in_the_table(data, recording):
