@@ -1,13 +1,14 @@
 """SIGINT, SIGTERM and SIGHUP alike: what runs ends in order, with the code that shells expect."""
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 came: list[int] = []
 """Signals that :func:`interrupt` has raised: destructors and callbacks swallow exceptions, so who
-waits in a loop looks here, too."""
+waits in a loop looks here, too. What Python would print of that, :func:`handled` leaves out."""
 
 Handler = Callable[[int, FrameType | None], object]
 
@@ -38,9 +39,13 @@ def ending() -> list[signal.Signals]:
 def handled(handler: Handler) -> Iterator[None]:
     """Within, these signals call ``handler``. For the main thread."""
     before = {number: signal.signal(number, handler) for number in ending()}
+    hook = sys.unraisablehook
+    sys.unraisablehook = lambda found: (
+        None if isinstance(found.exc_value, Interrupted) else hook(found))
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         for number, other in before.items():
             signal.signal(number, other)
 

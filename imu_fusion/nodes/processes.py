@@ -85,7 +85,8 @@ class NodeProcesses:
         try:
             for process in self._processes.values():
                 if process.poll() is None:
-                    process.send_signal(signal.SIGINT)
+                    # An interpreter that has just begun ends by it silently, by SIGINT not.
+                    process.send_signal(signal.SIGTERM)
             deadline = time.monotonic() + _PATIENCE
             for process in self._processes.values():
                 with contextlib.suppress(subprocess.TimeoutExpired):
