@@ -158,7 +158,7 @@ def withheld(row):
 
 
 def jumps(row):
-    """Lengths of 17 to 99 m, soft and hard landings; the error is that of the length."""
+    """Lengths of 11 to 126 m, soft and hard landings; the error is that of the length."""
     hill = load_surface("oberstdorf_hs106")
     for start in (-30.0, -40.0, -50.0, -60.0, -70.0, -78.0, -90.0):
         for own in ({}, {"sink_time": 0.12, "braking": 3.5}, {"sink_time": 0.03, "braking": 3.5}):
@@ -189,7 +189,7 @@ SITUATIONS = (
     ("fixes of status -2, without covariances", "refused", eights(unknown)),
     ("a sixth of the fixes 75 m beside the path", "misfit 1.02, nothing said", eights(canyon)),
     ("noise of the Imu six times as stated", "", eights(shaken)),
-    ("jumps of 17 to 99 m, soft and hard landings: length", "11 of 80 73-144 m too long, sd 1.9",
+    ("jumps of 11 to 126 m, soft and hard landings: length", "11 of 80 73-144 m too long, sd 1.9",
      jumps),
     ("real drive, defaults: 11 x 15 s without fixes", "NEES 16-25 (a walk)", withheld),
     ("real drive, wandering receiver, 4 Hz", "", car(1, True)),

@@ -56,7 +56,8 @@ def test_a_start_at_speed_finds_its_heading(drive, start, delays):
     imu, fix, velocity, _ = drive
     begin = int(imu.stamp[0] + start * 1e9)
     logs = [log.between(begin, begin + 60_000_000_000) for log in (imu, fix, velocity)]
-    # Fitted, a minute from 120 s on takes a part of the delay for a velocity that wanders (0.093 s).
+    # Fitted, a minute from 120 s on takes part of the delay (0.093 s of it are left) for a velocity
+    # that wanders.
     changes = {"maximum_likelihood": "off"}
     if delays:
         changes |= {"gnss.time_offset_sd": 0.2, "gnss.velocity_time_offset_sd": 0.2}
