@@ -125,11 +125,6 @@ class BallMotion:
         """Positions (n, 3) of a point (3,) m of the ball."""
         return self.position + Rotation.from_quat(self.quat).apply(point)
 
-    def velocity_of(self, point: ArrayLike) -> np.ndarray:
-        """Velocities (n, 3) of a point (3,) m of the ball, world."""
-        arm = np.asarray(point, dtype=float)
-        return self.vel + Rotation.from_quat(self.quat).apply(np.cross(self.omega, arm))
-
 
 class _Scene(NamedTuple):
     """What does not change during the motion."""
