@@ -10,6 +10,7 @@ of 2 s, each started from the gyroscopes' rate.
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from benchmarks.acceleration_field_cases import EXACT
 from benchmarks.data import data_path
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
@@ -27,7 +28,8 @@ RATE = 62.5
 LIMIT = np.radians(1000)
 # Where maximum likelihood begins: a hand's angular acceleration of about 500 rad/s^2 that
 # changes within 10 ms.
-BEGIN = AccelerationFieldParams(
+BEGIN = AccelerationFieldParams(    # chips on a board: as in config/mimu4444.yaml
+    sensor=EXACT,
     sample_rate=RATE, mode="smoothed", initial=Initial(duration=5.0),
     motion=Motion(rate=100.0, jerk_density=1e6, acceleration_rate_density=1e4),
     noise_scale=10.0, maximum_likelihood="motion_and_noise", iteration=Iteration(max=1))
@@ -112,7 +114,8 @@ def accelerometers_only(run):
              "noise_scale")
     fitted = {name: float(np.exp(np.median([np.log(f.get(name)) for f in fits])))
               for name in names}
-    given = AccelerationFieldParams(sample_rate=RATE, initial=begin.initial, max_condition=1e4)
+    given = AccelerationFieldParams(sample_rate=RATE, sensor=EXACT, initial=begin.initial,
+                                    max_condition=1e4)
     cases = {"AO (paper)": {"method": "ao"}, "sqrt-AO": {"method": "sqrt_ao"},
              "rigid_body, causal": fitted,
              "rigid_body, smoothed": {**fitted, "mode": "smoothed", "iteration.max": ITERATIONS}}

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from benchmarks.acceleration_field_cases import EXACT
 from benchmarks.table import write_table
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.params import (
@@ -25,6 +26,7 @@ SAMPLES, RATE, NOISE = 300, 50.0, 1e-2
 STATES = ("attitude", "omega", "alpha", "specific_force", "acceleration_world")
 # Angular acceleration of sd 100 rad/s^2 that forgets itself within 1 / RATE s.
 PARAMS = AccelerationFieldParams(
+    sensor=EXACT,
     initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=0.1,
                     orientation_sd=0.002),
     motion=Motion(rate=RATE, jerk_density=2 * 100 * RATE ** 1.5, acceleration_rate_density=300.0))
