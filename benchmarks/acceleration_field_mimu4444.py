@@ -21,7 +21,6 @@ from imu_fusion.estimation.acceleration_field.params import (
     Initial,
     Iteration,
     Motion,
-    Sensor,
 )
 
 RATE = 62.5
@@ -70,8 +69,8 @@ def clipped_gyroscope(run):
     judged = clipped & ~at_range
     # The chips differ this much, by their scale factors; their mean is trusted no better.
     spread = np.sqrt(np.mean(np.var(gyr, axis=1)[~at_range.any(axis=1)]))
-    gyroscope = Sensor(gyro_noise_density=spread / np.sqrt(RATE) / BEGIN.noise_scale,
-                       gyro_range=(LIMIT,))
+    gyroscope = EXACT.replace(gyro_noise_density=spread / np.sqrt(RATE) / BEGIN.noise_scale,
+                              gyro_range=(LIMIT,), gyro_axes_sd=0.0)
     fit = AccelerationFieldEstimator(BEGIN.replace(use_gyro=True, sensor=gyroscope),
                                      sensors(positions, noise))
     fit.run(stamp[:FIT_SAMPLES], acc[:FIT_SAMPLES], given[:FIT_SAMPLES])
