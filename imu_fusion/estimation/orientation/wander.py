@@ -2,10 +2,10 @@
 
 Innovations of a filter that knows its errors are white. Where they keep a sign for seconds an
 error that is no state, or larger than was said, moves the estimate: a scale or bias of the
-gyroscope beyond belief, acceleration that lasts, a field that turns with the place. The low-passed
-innovation is then larger than that of white ones, and the estimate's error exceeds what is stated by
-more than that: the filter follows what lasts, so that the innovation keeps a part of it only. A power
-of its mean square widens the attitude's covariance on output; gains stay.
+gyroscope beyond belief, acceleration that lasts, a field that turns with the place. The
+low-passed innovation is then larger than that of white ones, and the estimate's error exceeds what
+is stated by more than that: the filter follows what lasts, so that the innovation keeps a part of
+it only. A power of its mean square widens the attitude's covariance on output; gains stay.
 """
 
 import math

@@ -104,8 +104,8 @@ def test_the_number_of_hypotheses_cannot_change_while_running():
 
 
 def test_a_magnet_that_is_passed_says_little_of_the_place_of_the_rest():
-    """A twentieth of the time in a field half as large again: the heading of the first rest is known
-    as well as before. Where all places differ by as much, it is not."""
+    """A twentieth of the time in a field half as large again: the heading of the first rest is
+    known as well as before. Where all places differ by a third, it is not."""
     imu, mag, _ = recording(0.003)
     field = np.linalg.norm(earth_field())
     passed = mag.mag.copy()

@@ -264,8 +264,8 @@ def field(s, p, error, rows):
 
 @njit
 def _judge_scatter(s, z):
-    """Take the field z (3,) of one block into its mean square about that of the surroundings: as the
-    scale of a t distribution, in which a magnet that is passed counts little."""
+    """Take the field z (3,) of one block into its mean square about that of the surroundings: as
+    the scale of a t distribution, in which a magnet that is passed counts little."""
     s.scattered += 1
     off = ((z[0] - s.field[0]) ** 2 + (z[1] - s.field[1]) ** 2 + (z[2] - s.field[2]) ** 2) / 3.0
     weight = 1.0
