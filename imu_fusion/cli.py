@@ -84,8 +84,9 @@ def _remaps(values):
 
 remap_option = click.option("--remap", multiple=True, metavar="TOPIC:=OTHER",
                             help="Use topic OTHER of the recording for TOPIC. Repeatable.")
-params_file_option = click.option("--params-file", type=click.Path(),
-                                  help="ROS 2 parameter file, keyed by node name.")
+params_file_option = click.option("--params-file", type=click.Path(), multiple=True, metavar="FILE",
+                                  help="ROS 2 parameter file, keyed by node name. Repeatable: the "
+                                       "last one that names a value counts.")
 without_option = click.option("--without", multiple=True, metavar="NODE",
                               help="Leave an estimator out. Repeatable.")
 overwrite_option = click.option("--overwrite", is_flag=True,
@@ -114,7 +115,7 @@ def start_node(node: str, arguments: tuple[str, ...]) -> None:
 @overwrite_option
 @click.option("--force", is_flag=True,
               help="Estimate even where the samples make it wrong (see info).")
-def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+def process(bag: str, out: str, params_file: tuple[str, ...], without: tuple[str, ...],
             remap: tuple[str, ...], overwrite: bool, force: bool) -> None:
     """Run the estimators on BAG without ROS and write the rosbag2 directory OUT.
 
@@ -152,7 +153,7 @@ def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...
 @click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
 @remap_option
 @overwrite_option
-def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+def pipeline(bag: str, out: str, params_file: tuple[str, ...], without: tuple[str, ...],
              with_report: bool, remap: tuple[str, ...], overwrite: bool) -> None:
     """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
 
@@ -340,7 +341,7 @@ def _ros_args(**values):
               help="Recording with imu/data or acceleration_field/*, if not in BAG.")
 @params_file_option
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
-def report(bag: str, estimates: str | None, params_file: str | None, out: str) -> None:
+def report(bag: str, estimates: str | None, params_file: tuple[str, ...], out: str) -> None:
     """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
 
     The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
@@ -349,7 +350,7 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
     from imu_fusion.kernels import announced_compiling
     from imu_fusion.recordings.targets import refuse_files
     from imu_fusion.report.recording import write_recording_report
-    refuse_files([bag, estimates, params_file], out)
+    refuse_files([bag, estimates, *params_file], out)
     with announced_compiling(lambda text: click.echo(text, err=True)):
         complete = write_recording_report(bag, estimates, out, params_file).complete
     click.echo(f"written: {out}")
