@@ -20,7 +20,6 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError
-from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
 from imu_fusion.messages.convert import (
     bool_message,
     fix_message,
@@ -33,6 +32,7 @@ from imu_fusion.messages.convert import (
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, STRING_TYPE, TWIST
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.sensors.accelerometer_calibration import calibrate_array
 from imu_fusion.simulation.avalanche import Avalanche, AvalancheParams
 from imu_fusion.simulation.ball_sensors import EPOCH, LEVER_ARM, record_ball
 from imu_fusion.simulation.jump_sensors import record

@@ -52,7 +52,7 @@ ARROWS = {
     "report": ("errors", "kernels", "parameters", "geometry", "samples", "surfaces",
                "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
                "estimation.avalanche", "evaluation", "messages", "recordings", "streams", "batch"),
-    "calibrate": ("errors", "geometry", "recordings", "sensors"),
+    "calibrate": ("errors", "geometry", "recordings", "samples", "sensors"),
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
               "batch", "report", "calibrate"),
     "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",

@@ -8,7 +8,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.calibrate import calibrate_recorded_magnetometer, magnetometer_parameters
+from imu_fusion.calibrate.magnetometer import (
+    calibrate_recorded_magnetometer,
+    magnetometer_parameters,
+)
 from imu_fusion.demos.data import data_folder
 from imu_fusion.demos.trajectory import replay_and_smooth
 from imu_fusion.errors import EstimationError
@@ -52,10 +55,9 @@ def _error_table(slope, samples, pose):
     turn = (Rotation.from_quat(rows["quat_world_imu"]).inv()
             * Rotation.from_quat(pose.quat_world_imu[j])).as_rotvec()
     since = (rows["stamp"] - slope.descent.entrained) * 1e-9
-    table = Table("SIMULATED ball, error RMS", "longitudinal m", "lateral m", "transverse m",
-                  "NEES (ideal 3)", "attitude deg", "NEES (ideal 3)",
-                  title="stated standard deviation in brackets")
-    for name, end in (("to the gap in the data at 9 s", _BEFORE_GAP), ("all of the descent", 1e3)):
+    table = Table("RMS (stated)", "long. m", "lat. m", "transv. m", "NEES", "attitude deg", "NEES",
+                  title="SIMULATED ball: errors in the slope frame (NEES: ideal 3)")
+    for name, end in (("to the gap, 9 s", _BEFORE_GAP), ("all of it", 1e3)):
         part = (since >= 0.0) & (since < end)
         stated = np.sqrt(cov[part].diagonal(0, 1, 2).mean(axis=0))
         rms = np.sqrt(np.mean(error[part] ** 2, axis=0))

@@ -161,6 +161,9 @@ class Node(rclpy.node.Node):
                                 if name not in known and name.startswith(self.OPEN_PREFIXES)}
         for name, value in self.open_parameters.items():
             self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
+        for_all = parameter_file.names_for_all(params_files)
+        given = {name: value for name, value in given.items()
+                 if name in known or name not in for_all}
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"{unknown_parameter(unknown[0], self.PARAMETERS)} "

@@ -126,6 +126,12 @@ def resolve_paths(values: dict[str, Any], classes: Iterable[type[Parameters]], n
                 break
 
 
+def names_for_all(paths: Iterable[str | Path]) -> set[str]:
+    """Dotted names that files give to every node (``/**``): a node passes by those that it does
+    not know."""
+    return {name for path in paths for name in flatten(load(path).get("**", {}))}
+
+
 def node_values(node: str, path: ParamsFile, known: Container[str]) -> dict[str, Any]:
     """Names and values, dotted, that files give to a node: of ``/**`` only the known ones."""
     values: dict[str, Any] = {}

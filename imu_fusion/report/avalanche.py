@@ -144,7 +144,7 @@ def _phase_table(slope):
         k = slope.row(found.time)
         rows.append((f"{found.number} {NAMES[found.number]}", number(found.time, 2),
                      number(slope.position[k, 0], 1), number(velocity[k, 0], 2),
-                     number(np.linalg.norm(velocity[k]), 2), found.reason))
+                     number(float(np.linalg.norm(velocity[k])), 2), found.reason))
     return Table(("phase", "begins s", "distance m", "velocity down the slope m/s", "speed m/s",
                   "because"), tuple(rows), "Phases as Winkler et al. (2025, section 3.2) number "
                  "them.")
@@ -156,7 +156,7 @@ def _flight_table(slope):
         a, b = slope.row(flight.start), slope.row(flight.end)
         path = slope.position[a:b + 1]
         rows.append((number(flight.start, 2), number(flight.end - flight.start, 2),
-                     number(np.linalg.norm(path[-1] - path[0]), 1),
+                     number(float(np.linalg.norm(path[-1] - path[0])), 1),
                      number(_arch(path), 2)))
     return [Table(("begins s", "lasts s", "length m", "height m"), tuple(rows),
                   "Ballistic flights. Height: the most by which the path rises above the straight "
@@ -189,8 +189,9 @@ def _reckoned(slope):
     return slope.in_slope(track.position)
 
 
-def _path(x, y, name, color, **line):
-    return go.Scatter(x=np.float32(x), y=np.float32(y), mode="lines", name=name,
+def _path(points, name, color, **line):
+    """A line through points (x (n,), y (n,))."""
+    return go.Scatter(x=np.float32(points[0]), y=np.float32(points[1]), mode="lines", name=name,
                       line=dict(color=color, width=2, **line))
 
 
@@ -204,10 +205,10 @@ def _side_view(slope):
                                                               + place[:, 2] * out[1])
 
     (place,) = thinned(slope.position)
-    figure = go.Figure([_path(*_terrain(slope), "terrain", fig.REFERENCE, dash="dot"),
-                        _path(*section(_reckoned(slope)), "sensors alone, before calibration",
+    figure = go.Figure([_path(_terrain(slope), "terrain", fig.REFERENCE, dash="dot"),
+                        _path(section(_reckoned(slope)), "sensors alone, before calibration",
                               fig.HIGHLIGHT, dash="dash"),
-                        _path(*section(place), "smoothed", fig.ESTIMATE)])
+                        _path(section(place), "smoothed", fig.ESTIMATE)])
     return _scaled(figure, "distance along the fall line in m", "height in m", slope, section)
 
 
@@ -230,7 +231,7 @@ def _map(slope):
                    y=np.float32(np.r_[low, high[::-1]]), fill="toself", mode="lines",
                    line=dict(width=0), fillcolor="rgba(86,180,233,0.35)", hoverinfo="skip",
                    name=f"±{_TUBE:.0f}σ across"),
-        _path(place[:, 0], place[:, 1], "smoothed", fig.ESTIMATE)])
+        _path((place[:, 0], place[:, 1]), "smoothed", fig.ESTIMATE)])
     return _scaled(figure, "longitudinal in m", "lateral in m", slope,
                    lambda p: (p[:, 0], p[:, 1]))
 
