@@ -157,8 +157,8 @@ def _begin_step(s, p, stamp, sample):
         step.flags |= FLAG_HELD
         s.counts.rates_held += 1
         clipped = s.clipped     # nothing is known of this sample
-    if spike.hold(s.acc_spike, step.force[:], s.force_last[:], step.dt, spike.WILD_FORCE,
-                  step.missed_force[:]):
+    if p.use_acc and spike.hold(s.acc_spike, step.force[:], s.force_last[:], step.dt,
+                                spike.WILD_FORCE, step.missed_force[:]):
         step.flags |= FLAG_HELD
         s.counts.forces_held += 1
     step.clipped = clipped
