@@ -14,7 +14,7 @@ def tree(source, target, patterns):
 
 # PyPI builds of ROS 2 Jazzy, for machines without an apt ROS. Never mix the two.
 ros = ["ros-jazzy-rclpy>=7.1,<8", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"]
-report = ["plotly>=5.15"]
+report = ["plotly>=5.15", "matplotlib>=3.7"]
 devices = ["pyubx2>=1.2.40", "pynmeagps>=1.0.40", "pyulog>=1.0", "python-calamine>=0.2.3"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
@@ -62,7 +62,7 @@ setup(
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes:main" for node in nodes],
     ]},
-    package_data={"imu_fusion": ["py.typed"], "imu_fusion.report": ["*.css", "*.js"],
+    package_data={"imu_fusion": ["py.typed"], "imu_fusion.report": ["*.css", "*.js", "*.txt"],
                   "imu_fusion.nodes.flow": ["*.xml"]},
     zip_safe=False,
 )

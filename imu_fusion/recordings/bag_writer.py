@@ -52,6 +52,7 @@ class BagWriter:
         self._target = Path(directory).resolve()
         self.directory = self._target
         self._replaced: Path | None = None    # where what was there is kept until the end
+        self._folders: list[Path] = []        # that were made for it, innermost first
         self._whole = whole
         self.counts: Counter[str] = Counter()
         self._channels: dict[str, int] = {}
@@ -78,6 +79,7 @@ class BagWriter:
                 if why or not overwrite:
                     raise BagError(f"{target}: exists and is not empty; choose another directory"
                                    + (f" ({why})" if why else ""))
+            self._folders = [p for p in target.parents if not p.exists()]
             target.parent.mkdir(parents=True, exist_ok=True)
             if self._whole:
                 # Inside of an empty directory that is there: it may be a mount point.
@@ -104,6 +106,9 @@ class BagWriter:
             shutil.rmtree(self.directory)
         if self._replaced is not None:
             os.rename(self._replaced, self._target)
+        for folder in self._folders:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
     def _appear(self):
         """Put the complete recording at its place; let go of what it replaces."""
