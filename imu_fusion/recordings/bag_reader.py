@@ -232,7 +232,7 @@ class Reader:
             self.topics.pop(other, None)
         for name, info in infos.items():
             hidden = find_topic(self.topics, name)
-            if hidden is not None and hidden not in taken:
+            if hidden is not None:
                 self.mention(f"{hidden} of the recording is left out: {info.name} goes by its name")
                 del self.topics[hidden]
             self.recorded[name] = info.name

@@ -16,7 +16,13 @@ from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.recordings.mcap_writer import McapWriter
 from imu_fusion.recordings.qos import qos_profile
-from imu_fusion.recordings.targets import LIBRARY, METADATA_FILE, why_not_replaced
+from imu_fusion.recordings.targets import (
+    LIBRARY,
+    METADATA_FILE,
+    make_parents,
+    remove_empty,
+    why_not_replaced,
+)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -79,8 +85,7 @@ class BagWriter:
                 if why or not overwrite:
                     raise BagError(f"{target}: exists and is not empty; choose another directory"
                                    + (f" ({why})" if why else ""))
-            self._folders = [p for p in target.parents if not p.exists()]
-            target.parent.mkdir(parents=True, exist_ok=True)
+            self._folders = make_parents(target)
             if self._whole:
                 # Inside of an empty directory that is there: it may be a mount point.
                 inside = target.is_dir() and not occupied
@@ -106,9 +111,7 @@ class BagWriter:
             shutil.rmtree(self.directory)
         if self._replaced is not None:
             os.rename(self._replaced, self._target)
-        for folder in self._folders:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        remove_empty(self._folders)
 
     def _appear(self):
         """Put the complete recording at its place; let go of what it replaces."""

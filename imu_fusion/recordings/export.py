@@ -23,7 +23,7 @@ from imu_fusion.messages.layouts import (
     Layout,
 )
 from imu_fusion.recordings.bag_reader import Reader, open_bag
-from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.recordings.targets import make_parents, refuse_source, remove_empty
 
 _BLOCK = 2000    # messages that are decoded at once
 _XYZ = ("x", "y", "z")
@@ -106,8 +106,10 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
     if out.exists():
         raise BagError(f"{out}: exists already; choose another folder")
     part = out.with_name(f".{out.name}.part-{os.getpid()}")
+    folders: list[Path] = []
     try:
-        part.mkdir(parents=True)
+        folders = make_parents(out)
+        part.mkdir()
         with open_bag(path) as reader:
             wanted = [reader.require(topic).name for topic in topics] or list(reader.topics)
             counts: dict[str, int] = {}
@@ -123,6 +125,7 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
         raise BagError(f"{out}: cannot be written ({error.strerror})") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
+        remove_empty(folders)
     return counts
 
 

@@ -1,5 +1,6 @@
 """Where a recording may be written: not over what it is made of, nor over other files."""
 
+import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -60,6 +61,20 @@ def _identities(path: Path) -> Iterator[tuple[int, int]]:
         except OSError:    # a link that leads nowhere
             return
         yield status.st_dev, status.st_ino
+
+
+def make_parents(target: Path) -> list[Path]:
+    """Make the folders that a target shall stand in; those made, innermost first."""
+    missing = [folder for folder in target.parents if not folder.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those of the folders that hold nothing, innermost first."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def why_not_replaced(directory: Path) -> str:

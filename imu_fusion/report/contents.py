@@ -19,7 +19,7 @@ from imu_fusion.report.orientation_status import Status
 from imu_fusion.report.smoother import Smoothed
 from imu_fusion.report.trajectory_data import read_result
 from imu_fusion.samples import AttitudeLog
-from imu_fusion.samples.guard import guard_log
+from imu_fusion.samples.guard import usable_part
 from imu_fusion.samples.logs import Log
 from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
 from imu_fusion.streams.stage import StageReport
@@ -178,12 +178,8 @@ def _usable(log, name, warnings):
         if absent.any():
             warnings.append(f"{name}: {absent.sum()} orientations are zero and left out")
             log = log[~absent]
-    log, epochs, guard = guard_log(log)
-    for reason, count in guard.refused().items():
-        warnings.append(f"{name}: {count} samples left out: {reason}")
-    if len(epochs) and epochs[-1] > 0:
-        warnings.append(f"{name}: the clock was set back; only what comes before is shown")
-        log = log[epochs == 0]
+    log, texts = usable_part(log, name)
+    warnings += texts
     return log
 
 
