@@ -18,6 +18,8 @@ report = ["plotly>=5.15", "matplotlib>=3.7"]
 notebook = ["pandas>=2"]
 devices = ["pyubx2>=1.2.40", "pynmeagps>=1.0.40", "pyulog>=1.0", "python-calamine>=0.2.3"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
+# Brings matplotlib and sphinx along.
+calibrate = ["allantools>=2024.6"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
 docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
@@ -56,7 +58,7 @@ setup(
         "rosbags>=0.10", "mcap>=1.1", "zstandard", "lz4",
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
-    extras_require={"ros": ros, "report": report, "notebook": notebook,
+    extras_require={"ros": ros, "report": report, "notebook": notebook, "calibrate": calibrate,
                     "devices": devices, "terrain": terrain,
                     "peers": peers,
                     "oracles": oracles, "docs": docs, "test": test},

@@ -108,7 +108,7 @@ def test_a_report_shows_the_trajectory_that_it_is_given(tmp_path):
     with open_bag(tmp_path / "out") as reader:
         found, remarks, why = read_result(reader)
     assert not why and remarks == report.remarks
-    for name in ("position_world", "vel_world", "quat_world_imu", "gyr", "cov_position",
+    for name in ("position_world", "vel_world", "quat_world_imu", "gyr", "acc", "acc_sd", "cov_position",
                  "cov_attitude", "cov_velocity", "gyr_sd"):
         np.testing.assert_allclose(found.samples[name], whole.result.samples[name], rtol=1e-6,
                                    atol=1e-9)

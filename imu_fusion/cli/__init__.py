@@ -10,7 +10,7 @@ import sys
 import click
 
 import imu_fusion
-from imu_fusion.cli import estimates, files, nodes
+from imu_fusion.cli import calibrations, estimates, files, nodes
 from imu_fusion.cli.common import Group
 from imu_fusion.signals import Interrupted, handled, interrupt
 
@@ -23,8 +23,8 @@ def cli() -> None:
 
 for command in (
         files.info, files.convert, files.describe, estimates.process, estimates.pipeline,
-        estimates.report, files.export, estimates.lengths, estimates.calibrate, files.translate,
-        nodes.run, nodes.play, nodes.record, nodes.demo, nodes.compile_kernels):
+        estimates.report, files.export, files.avaframe, estimates.lengths, calibrations.calibrate,
+        files.translate, nodes.run, nodes.play, nodes.record, nodes.demo, nodes.compile_kernels):
     cli.add_command(command)
 
 

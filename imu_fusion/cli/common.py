@@ -23,8 +23,9 @@ class Group(click.Group):
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
         except ModuleNotFoundError as error:
-            extra = {"rclpy": "ros", "plotly": "report", "matplotlib": "report"}.get(
-                (error.name or "").partition(".")[0])
+            extras = {"rclpy": "ros", "plotly": "report", "matplotlib": "report",
+                      "allantools": "calibrate"}
+            extra = extras.get((error.name or "").partition(".")[0])
             if extra is None:
                 raise
             click.echo(f"imu_fusion: this needs {error.name}: pip install 'imu_fusion[{extra}]'"
@@ -59,8 +60,9 @@ def _remaps(_context: click.Context, _option: click.Parameter, values: Iterable[
 
 remap_option = click.option("--remap", multiple=True, metavar="TOPIC:=OTHER", callback=_remaps,
                             help="Use topic OTHER of the recording for TOPIC. Repeatable.")
-params_file_option = click.option("--params-file", type=click.Path(),
-                                  help="ROS 2 parameter file, keyed by node name.")
+params_file_option = click.option("--params-file", type=click.Path(), multiple=True, metavar="FILE",
+                                  help="ROS 2 parameter file, keyed by node name. Repeatable: the "
+                                       "last one that names a value counts.")
 without_option = click.option("--without", multiple=True, metavar="NODE",
                               help="Leave an estimator out. Repeatable.")
 overwrite_option = click.option("--overwrite", is_flag=True,

@@ -1,4 +1,4 @@
-"""Commands that estimate and tell of estimates: process, pipeline, report, lengths, calibrate."""
+"""Commands that estimate and tell of estimates: process, pipeline, report, lengths."""
 
 import sys
 from pathlib import Path
@@ -18,7 +18,7 @@ from imu_fusion.cli.common import (
     warn,
     without_option,
 )
-from imu_fusion.errors import ImuFusionError, ParameterError
+from imu_fusion.errors import ImuFusionError
 
 
 @click.command()
@@ -111,7 +111,7 @@ def _is_incomplete(out):
 @report_option
 @remap_option
 @overwrite_option
-def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+def pipeline(bag: str, out: str, params_file: tuple[str, ...], without: tuple[str, ...],
              with_report: bool, remap: dict[str, str], overwrite: bool) -> None:
     """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
 
@@ -137,7 +137,7 @@ def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ..
               help="Write each figure into FOLDER, too, as wide as a column of a paper.")
 @click.option("--format", "form", type=click.Choice(["svg", "pdf", "png"]), default="svg",
               show_default=True, help="Of the figures.")
-def report(bag: str, estimates: str | None, params_file: str | None, remap: dict[str, str],
+def report(bag: str, estimates: str | None, params_file: tuple[str, ...], remap: dict[str, str],
            out: str, figures: str | None, form: str) -> None:
     """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
 
@@ -146,7 +146,7 @@ def report(bag: str, estimates: str | None, params_file: str | None, remap: dict
     in BAG shows the errors.
     """
     from imu_fusion.recordings.targets import refuse_files
-    refuse_files([bag, estimates, params_file], out)
+    refuse_files([bag, estimates, *params_file], out)
     complete = _write_report(bag, estimates, out, params_file, remap, figures, form)
     end(not complete)
 
@@ -163,39 +163,6 @@ def _write_report(bag, estimates, path, params_file, remap, figures=None, form="
         for file in write_figures(written.sections, figures, form):
             click.echo(f"written: {file}")
     return written.complete
-
-
-@click.group()
-def calibrate() -> None:
-    """Calibrate a sensor from a recording, as a parameter file."""
-
-
-@calibrate.command("magnetometer")
-@click.argument("bag", type=click.Path())
-@click.option("--topic", default="imu/mag", show_default=True, help="Its topic in BAG.")
-@click.option("--out", type=click.Path(), help="Parameter file to write.")
-def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
-    """Hard and soft iron from BAG, in which the sensor turned about all axes.
-
-    Prints how well it is determined, and sensor.mag_offset and sensor.mag_matrix as the
-    orientation estimator and the smoother take them.
-    """
-    from imu_fusion import calibrate as calibration
-    found, remarks = calibration.calibrate_recorded_magnetometer(bag, topic)
-    table = Table("magnetometer", "")
-    for name, value in calibration.magnetometer_report(found):
-        table.add_row(name, value)
-    console.print(table)
-    warn(remarks)
-    text = calibration.magnetometer_parameters(found, bag)
-    if out is None:
-        click.echo(text)
-        return
-    try:
-        Path(out).write_text(text)
-    except OSError as error:
-        raise ParameterError(f"{out}: cannot be written ({error.strerror})") from None
-    click.echo(f"written: {out}")
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""Commands between files: info, convert, export, describe, translate."""
+"""Commands between files: info, convert, export, avaframe, describe, translate."""
 
 import sys
 from pathlib import Path
@@ -101,6 +101,23 @@ def export(bag: str, out: str, topics: tuple[str, ...], forms: tuple[str, ...]) 
     from imu_fusion.recordings.export import export as export_tables
     for name, rows in export_tables(bag, out, topics, forms).items():
         click.echo(f"written: {Path(out) / name} with {rows} rows")
+
+
+@click.command()
+@click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--crs", metavar="EPSG:CODE", help="Reference system of X and Y; without it they are "
+              "east and north of the origin.")
+@click.option("--interval", type=click.FloatRange(min=1e-3), default=0.1, show_default=True,
+              help="Seconds between rows.")
+def avaframe(bag: str, out: str, crs: str | None, interval: float) -> None:
+    """Write the smoothed trajectory in BAG as the CSV file OUT for AvaFrame.
+
+    Its comparison of particles reads these columns: X, Y, Z, ux, uy, uz, velocityMag, uAcc,
+    trajectoryLengthXY, trajectoryLengthXYZ, time.
+    """
+    from imu_fusion.recordings.avaframe import export_avaframe
+    click.echo(f"written: {out} with {export_avaframe(bag, out, crs, interval)} rows")
 
 
 @click.command()

@@ -13,6 +13,7 @@ from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.messages.convert import attitude_log, bool_value
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.inspect import TopicReport, inspect_topics
 from imu_fusion.report.orientation_status import Status
@@ -118,13 +119,13 @@ def read_recorded(path: str | Path, remap: Mapping[str, str] | None = None) -> R
                         [f"{SMOOTHER}: {remark}" for remark in remarks], list(reader.topics))
 
 
-def make_estimates(bag: str | Path, params_file: str | Path | None, with_orientation: bool,
+def make_estimates(bag: str | Path, params_file: ParamsFile, with_orientation: bool,
                    remap: Mapping[str, str] | None = None) -> tuple[Estimates, StageReport]:
     """What ``process`` would say of a recording: Estimates, and the smoother's StageReport.
 
     Args:
         bag: recording.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         with_orientation: whether the orientation is estimated, too.
         remap: topic names of ours to those in the recording.
     """

@@ -15,7 +15,9 @@ from imu_fusion.evaluation.orientation_error import (
     moving_at,
     orientation_errors,
 )
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.report.acceleration_field import field_sections
+from imu_fusion.report.avalanche import slope_of, slope_section
 from imu_fusion.report.contents import (
     FIX_TOPIC,
     MAGNETOMETER,
@@ -132,7 +134,7 @@ class _Material:
 
 
 def write_recording_report(bag: str | Path, estimates: str | Path | None, path: str | Path,
-                           params_file: str | Path | None = None,
+                           params_file: ParamsFile = None,
                            remap: Mapping[str, str] | None = None) -> Written:
     """Write the HTML report of a recording.
 
@@ -143,7 +145,7 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
             says what it lacks. None: those in ``bag``, and what it lacks of orientation and
             trajectory as ``process`` would make it.
         path: HTML file to write.
-        params_file: ROS 2 parameter file of the estimators, or None for defaults.
+        params_file: ParamsFile of the estimators; None: defaults.
         remap: topic names of ours to those in ``bag``.
 
     Returns:
@@ -226,6 +228,9 @@ def _estimates(material) -> list[Section]:
         in_world = m.is_truth and m.smoothed.surface is not None \
             and np.any(m.reference.position_world)
         sections += smoother_sections(m.smoothed, m.reference if in_world else None)
+        slope = slope_of(m.smoothed, m.raw)
+        if slope is not None:
+            sections.insert(1, slope_section(slope, contents.log(MAGNETOMETER)))
     if m.estimate is not None:
         sections.append(orientation_section(m.estimate, m.origin, m.reference,
                                             contents.reference_name or "", m.shades))
