@@ -108,8 +108,8 @@ def test_a_report_shows_the_trajectory_that_it_is_given(tmp_path):
     with open_bag(tmp_path / "out") as reader:
         found, remarks, why = read_result(reader)
     assert not why and remarks == report.remarks
-    for name in ("position_world", "vel_world", "quat_world_imu", "gyr", "acc", "acc_sd", "cov_position",
-                 "cov_attitude", "cov_velocity", "gyr_sd"):
+    for name in ("position_world", "vel_world", "quat_world_imu", "gyr", "acc", "acc_sd",
+                 "cov_position", "cov_attitude", "cov_velocity", "gyr_sd"):
         np.testing.assert_allclose(found.samples[name], whole.result.samples[name], rtol=1e-6,
                                    atol=1e-9)
     assert found.frame == whole.result.frame and found.summary() == whole.result.summary()
@@ -122,7 +122,7 @@ def test_a_report_without_a_trajectory_says_why(tmp_path):
     bag = write(tmp_path / "bag")
     out = tmp_path / "r.html"
     call("report", bag, "--out", out)
-    assert "There is no trajectory: no messages on 'fix'" in Page(out.read_text()).text
+    assert "There is no smoothed trajectory: no messages on 'fix'" in Page(out.read_text()).text
     call("report", bag, "--out", out)    # over the last one
     call("process", bag, tmp_path / "out", "--report")
     call("report", bag, "--estimates", tmp_path / "out", "--out", tmp_path / "out" / "report.html")

@@ -79,7 +79,6 @@ def open_bag(path: str | Path, description: str | Path | None = None,
                 reader.open_source(description)
             else:
                 reader.open(_storage_files(path, reader.warnings))
-            reader.rename(remap or {})
         except (OSError, ValueError) as error:    # ValueError: a name that no file can have
             if isinstance(error, ImuFusionError):
                 raise
@@ -87,6 +86,7 @@ def open_bag(path: str | Path, description: str | Path | None = None,
         except (MemoryError, RecursionError, ArithmeticError, LookupError, TypeError) as error:
             raise BagError(f"{path}: damaged beyond reading ({type(error).__name__}: {error})"
                            ) from error
+        reader.rename(remap or {})
     except BaseException:
         reader.close()
         raise

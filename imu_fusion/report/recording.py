@@ -215,7 +215,7 @@ def _summary(material) -> Section:
                                               "estimate too: what follows are differences, not "
                                               "errors.")))
     if m.smoothed is None:
-        blocks.append(Text(f"There is no trajectory: {m.obstacle}."))
+        blocks.append(Text(f"There is no smoothed trajectory: {m.obstacle}."))
     return Section("Summary", tuple(blocks))
 
 

@@ -32,7 +32,8 @@ def read_result(reader: Reader) -> tuple[SmootherResult | None, list[str], str]:
     names = [reader.find(topic) for topic in (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, RESULTS_TOPIC)]
     if None in names or not all(reader.topics[name].count for name in names if name):
         return None, [], f"{reader.path.name} holds no trajectory on {ODOMETRY_TOPIC}"
-    odometry, imu, results = ([cdr for *_, cdr in reader.messages([name])] for name in names if name)
+    odometry, imu, results = ([cdr for *_, cdr in reader.messages([name])]
+                              for name in names if name)
     found = results_value(results[-1])
     if "origin" not in found:
         return None, [], (f"{reader.path.name} does not say where its trajectory begins; an older "

@@ -156,7 +156,8 @@ def test_a_report_makes_nothing_where_estimates_are_given_and_says_what_these_la
     write_recording_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
     page = Page(out.read_text())
     assert "px4_plane holds no estimates, but /fix, " in page.text
-    assert "There is no trajectory: px4_plane holds no trajectory on smoother/odometry" in page.text
+    assert ("There is no smoothed trajectory: px4_plane holds no trajectory on smoother/odometry"
+            in page.text)
     assert re.findall(r"<h2>(.*?)</h2>", out.read_text()) == [
         "Summary", "The recording", "Angular rates and specific force", "GNSS"]
 
