@@ -2,14 +2,17 @@
 
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imu_fusion import samples
 from imu_fusion.arrays import orientation, to_dataframe
 from imu_fusion.errors import SampleError
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.samples import ImuLog
 
 T = 0.01 * np.arange(1200)
@@ -53,6 +56,12 @@ def test_times_in_seconds_and_in_nanoseconds_are_the_same():
 def test_a_log_becomes_a_frame():
     found = to_dataframe(ImuLog(np.array([5, 7]), np.eye(3)[:2], np.ones((2, 3))))
     assert list(found) == ["time", "stamp", "gyr_x", "gyr_y", "gyr_z", "acc_x", "acc_y", "acc_z"]
+
+
+def test_the_page_names_every_field():
+    page = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text()
+    for name in (*ORIENTATION_DTYPE.names, *(log for log in samples.__all__ if "Log" in log)):
+        assert f"`{name}`" in page, name
 
 
 def test_what_is_wrong_is_said():
