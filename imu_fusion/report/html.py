@@ -105,7 +105,9 @@ class Figure:
     linked: bool = True
 
     def render(self) -> str:
-        data = json.dumps(_with_arrays_packed(self.figure.to_plotly_json()))
+        arrays: dict[bytes, int] = {}
+        parts = _without_arrays(self.figure.to_plotly_json(), arrays)
+        data = json.dumps(parts | {"arrays": [_packed(planes) for planes in arrays]})
         # Inside <script> only "<" could end the element or open a comment.
         data = data.replace("<", "\\u003c")
         caption = f"<figcaption>{html.escape(self.caption)}</figcaption>" if self.caption else ""
@@ -115,18 +117,22 @@ class Figure:
                 f'<script type="application/json">{data}</script>{caption}</figure>')
 
 
-def _with_arrays_packed(value):
-    """JSON of plotly whose arrays are float32, first bytes first: neighbours have these in common,
-    so that they become small."""
+def _without_arrays(value, arrays):
+    """JSON of plotly with {"array": k} for its arrays, which go to ``arrays``: bytes to k.
+
+    Equal ones are kept once, as float32, all first bytes ahead of all second ones: neighbours have
+    these in common, so that they pack well.
+    """
     if isinstance(value, dict) and "bdata" in value:    # plotly 6 and later
         value = np.frombuffer(base64.b64decode(value["bdata"]), value["dtype"])
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         array = np.ascontiguousarray(value, dtype="<f4").reshape(-1)
-        return {"dtype": "f4", "packed": _packed(array.view("u1").reshape(-1, 4).T.tobytes())}
+        planes = array.view("u1").reshape(-1, 4).T.tobytes()
+        return {"array": arrays.setdefault(planes, len(arrays))}
     if isinstance(value, dict):
-        return {key: _with_arrays_packed(part) for key, part in value.items()}
+        return {key: _without_arrays(part, arrays) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_with_arrays_packed(part) for part in value]
+        return [_without_arrays(part, arrays) for part in value]
     return value
 
 

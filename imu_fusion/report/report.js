@@ -14,7 +14,7 @@ async function unpack(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Arrays come as {"dtype": "f4", "packed": ...}: all first bytes of float32, all second ones, ...
+// An array of float32 comes as all first bytes, all second ones, ...
 async function floats(text) {
   const bytes = await unpack(text);
   const count = bytes.length / 4;
@@ -26,15 +26,9 @@ async function floats(text) {
 }
 
 async function figureOf(text) {
-  const waiting = [];
-  const figure = JSON.parse(text, function (key, value) {
-    if (value !== null && value.dtype === "f4") {
-      waiting.push(floats(value.packed).then((array) => { this[key] = array; }));
-    }
-    return value;
-  });
-  await Promise.all(waiting);
-  return figure;
+  const arrays = await Promise.all(JSON.parse(text).arrays.map(floats));
+  return JSON.parse(text, (key, value) => (
+    value !== null && value.array !== undefined ? arrays[value.array] : value));
 }
 
 // On a phone, margins and labels leave most of the width to the signals.

@@ -11,13 +11,14 @@ from imu_fusion.report.figures import Band, Line, Panel, Shade, style, time_figu
 from imu_fusion.report.html import Figure, Section, Text
 from imu_fusion.report.paper import COLUMN_WIDTH, draw, write_figures
 
-T = np.linspace(0.0, 9.0, 40)
+T = np.linspace(0.0, 9.0, 400)
 
 
 def over_time():
     gap = np.where((T > 3.0) & (T < 4.0), np.nan, np.sin(T))
     return time_figure([
-        Panel("a in m", (Band("±1σ", T, gap - 0.1, gap + 0.1), Line("price in $", T, gap, "#0072B2"),
+        Panel("a in m", (Band("±1σ", T, gap - 0.1, gap + 0.1),
+                         Line("price in $", T, gap, "#0072B2"),
                          Line("fixes", T, np.cos(T), "#D55E00", markers=True))),
         Panel("b in s", (Line("other", T, T, "#009E73", dash="dot"),), title="<raw>",
               from_zero=True)], [Shade("in the air", ((2.0, 5.0),))])

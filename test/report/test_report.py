@@ -167,8 +167,8 @@ def test_hours_of_data_give_a_page_of_bounded_size():
     time = np.arange(n) * 0.0035
     lines = tuple(Line(f"s{i}", time, np.sin(time * (i + 1)), "#000000") for i in range(3))
     text = Figure(time_figure([Panel("y", lines)] * 3)).render()
-    # 9 lines x 3000 points x 2 x float32 in base64 are 288 kB.
-    assert len(text) < 300_000
+    # 9 lines x 2400 points x 2 x float32 in base64 are 230 kB.
+    assert len(text) < 230_000
 
 
 def test_time_axes_are_one_and_all_panels_are_labelled():
