@@ -19,6 +19,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,15 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from benchmarks.fuzz_devices import (
+    DEVICES,
+    read_answer,
+    read_device,
+    read_push,
+    write_answer,
+    write_device,
+    write_push,
+)
 from benchmarks.table import write_table
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
@@ -163,7 +173,11 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "csv_description": (lambda f: write_csv(f).with_name("table.yaml"), read_description),
     "parameters": (lambda f: write_text(f, "p.yaml", PARAMETERS), load),
     "surface": (lambda f: write_text(f, "s.yaml", SURFACE), load_surface),
+    **{kind: (partial(write_device, kind), partial(read_device, kind)) for kind in DEVICES},
+    "phyphox_live": (write_answer, read_answer),
+    "sensor_logger_push": (write_push, read_push),
 }
+_TEXT = (".csv", ".yaml", ".txt", ".gpx", ".nmea", ".json")
 
 _WORDS = (b"0", b"-1", b"1e999999", b"nan", b"inf", b"1_0", b"9" * 400, b"'", b'"', b"[", b"{",
           b"}", b"&a ", b"*a", b"!!python/object/apply:os.system [x]", b"\t", b"\0", b"\xff\xfe",
@@ -250,7 +264,7 @@ def run(kind: str, count: int, seed: int, keep: Path | None) -> dict:
             sys.exit(f"{kind}: the sound file cannot be read")
         (original.parent / "metadata.yaml").unlink(missing_ok=True)
         for _ in range(count):
-            broken, done = mutated(data, rng, original.suffix in (".csv", ".yaml"))
+            broken, done = mutated(data, rng, original.suffix in _TEXT)
             original.write_bytes(broken)
             began = time.perf_counter()
             result = outcome(read, original)

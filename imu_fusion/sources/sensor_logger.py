@@ -200,7 +200,9 @@ class SensorLoggerPush(Source):
             batch = json.loads(data)
             number, session = int(batch["messageId"]), str(batch["sessionId"])
             payload = list(batch["payload"])
-        except (ValueError, KeyError, TypeError, RecursionError):
+            if not 0 <= number < 2**53:
+                raise ValueError
+        except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
             self.lose("batches that are not Sensor Logger's")
             return []
         self.device = f"Sensor Logger: {batch.get('deviceId', '')}"[:80]

@@ -85,7 +85,11 @@ class Ulog(WholeSource):
         for dataset in log.data_list:
             if len(dataset.data.get("timestamp", ())):
                 sets.setdefault(dataset.name, dataset.data)
-        blocks = self._blocks(sets)
+        try:
+            blocks = self._blocks(sets)
+        except LookupError as error:
+            raise SampleError(f"{part}: its definitions are damaged: there is no {error}"
+                              ) from None
         if not blocks:
             raise SampleError(f"{part}: none of {', '.join(_WANTED)} was logged")
         return blocks
