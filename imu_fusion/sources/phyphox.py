@@ -88,7 +88,8 @@ def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
     fixes = FixLog(stamp, lat, lon, height, cov, np.where(valid, FIXED, NO_FIX))[there]
     course = np.radians(direction)    # clockwise from north
     moves = (speed >= 0) & (direction >= 0)
-    vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
+    with np.errstate(invalid="ignore", over="ignore"):    # of an infinite one
+        vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
     cov = np.tile(np.diag([_SPEED_SD, _SPEED_SD, UNKNOWN_CLIMB_SD]) ** 2, (len(stamp), 1, 1))
     return named({FIX_TOPIC: fixes, VELOCITY_TOPIC: VelocityLog(stamp, vel, cov)[moves]})
 

@@ -119,7 +119,7 @@ def test_a_replayer_whose_recorder_has_died_does_not_play_on(tmp_path):
     assert trial.codes == [("recorder", -9), ("replayer", 3)] and not trial.amiss
 
 
-@pytest.mark.parametrize("command", ["pipeline", "demo"])
+@pytest.mark.parametrize("command", ["pipeline", pytest.param("demo", marks=pytest.mark.slow)])
 def test_kill_9_of_a_command_ends_what_it_has_started(tmp_path, command):
     faults.write_bag(tmp_path / "bag")
     arguments = [word.format(tmp=tmp_path) for word in COMMANDS[command]]
