@@ -96,7 +96,8 @@ class NodeProcesses:
             for process in self._processes.values():
                 process.kill()
                 process.wait()
-                process.stdin.close()
+                if process.stdin is not None:
+                    process.stdin.close()
             if self._claim is not None:
                 self._claim.close()
 

@@ -26,12 +26,14 @@ from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.nodes.pipeline import find_left_out, plan_pipeline
+from imu_fusion.recordings import mcap_records, ros1_storage
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.mcap_records import MAGIC
 from imu_fusion.recordings.repair import repair
+from imu_fusion.recordings.storage import DamageError
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.orientation import OrientationStream
 from imu_fusion.streams.smoother import SmootherStream
@@ -263,6 +265,12 @@ def test_a_chunk_unpacks_within_a_bound_that_can_be_raised(tmp_path, monkeypatch
                      message(imu(0)), chunk(name, packed, 1000))
         assert "another size than the 1000 bytes" in through("info", lying, None).output
         monkeypatch.delenv("IMU_FUSION_MAX_CHUNK_MB")
+
+
+def test_a_chunk_of_zeros_is_no_million_of_records(tmp_path):
+    assert not list(mcap_records.records(bytes(100)))
+    with pytest.raises(DamageError):
+        next(ros1_storage._records(bytes(100)))
 
 
 @pytest.mark.parametrize("length", [0, 2**31 - 1, 2**32 - 1])
