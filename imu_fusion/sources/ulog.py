@@ -135,7 +135,7 @@ class Ulog(WholeSource):
         """UTC of boot in ns."""
         if gps is not None:
             utc, boot = (gps[n].astype(np.int64) for n in ("time_utc_usec", "timestamp"))
-            known = (utc > _UTC[0]) & (utc < _UTC[1])
+            known = (utc > _UTC[0]) & (utc < _UTC[1]) & (boot >= 0) & (boot < _UTC[0])
             if known.any():
                 return int(np.median(utc[known] - boot[known])) * 1000
         self.remark("the receiver never knew UTC: stamps begin at an arbitrary instant")
