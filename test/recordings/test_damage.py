@@ -260,6 +260,8 @@ def test_a_chunk_unpacks_within_a_bound_that_can_be_raised(tmp_path, monkeypatch
         monkeypatch.setenv("IMU_FUSION_MAX_CHUNK_MB", "50")
         result = through("info", file, None)
         assert result.exit_code == INCOMPLETE and "IMU_FUSION_MAX_CHUNK_MB" in result.output
+        assert "--max-chunk-mb" in result.output
+        assert run("--max-chunk-mb", "70", "info", file).exit_code == 0
         # What it says is not what it unpacks to.
         lying = mcap(tmp_path / "lying.mcap", schema(IMU.msgtype), channel("/imu"),
                      message(imu(0)), chunk(name, packed, 1000))

@@ -49,7 +49,9 @@ def test_a_clock_set_back_costs_certainty_not_truth(back, live):
         return stamp - (stamp >= 6_000_000_000) * back * 1_000_000
 
     stream, found, truth, told = run(change, live)
-    assert stream.restarts == 1 and not stream.refused(IMU_TOPIC) and not stream.refused(MAG_TOPIC)
+    assert stream.restarts == 1 and not stream.refused(IMU_TOPIC)
+    # Live, what the magnetometer holds back when the Imu has proven the jump is lost.
+    assert sum(stream.refused(MAG_TOPIC).values()) <= (2 if live else 0)
     # Stamps come twice: the estimates after the jump are the last ones, in order.
     after = int(np.flatnonzero(np.diff(found.stamp) < 0)[-1]) + 1
     stamps = told[600:]
