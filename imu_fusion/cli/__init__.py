@@ -5,6 +5,7 @@ wrong usage ends with 2; one that SIGINT, SIGTERM or SIGHUP has ended with 130, 
 something was lost, in a damaged recording or on the way, and the rest was used, the code is 3.
 """
 
+import os
 import sys
 
 import click
@@ -17,8 +18,13 @@ from imu_fusion.signals import Interrupted, handled, interrupt
 
 @click.group(cls=Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(imu_fusion.__version__)
-def cli() -> None:
+@click.option("--max-chunk-mb", type=click.FloatRange(min=1.0), metavar="MB",
+              help="Most that a chunk of a recording may unpack to.  [default: 256, or "
+                   "IMU_FUSION_MAX_CHUNK_MB]")
+def cli(max_chunk_mb: float | None) -> None:
     """Orientation, acceleration fields and trajectories from inertial sensors."""
+    if max_chunk_mb is not None:
+        os.environ["IMU_FUSION_MAX_CHUNK_MB"] = f"{max_chunk_mb:g}"    # of the nodes, too
 
 
 for command in (

@@ -23,7 +23,7 @@ from imu_fusion.errors import ParameterError
 def info(bag: str, target: str | None) -> None:
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
     from imu_fusion.recordings.bag_reader import open_bag
-    from imu_fusion.recordings.inspect import inspect_topics
+    from imu_fusion.recordings.inspect import STRETCH, inspect_topics
     from imu_fusion.recordings.losses import read_losses
     from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
@@ -31,7 +31,7 @@ def info(bag: str, target: str | None) -> None:
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s"
                    + (f", {reader.format}" if reader.format else ""))
         losses = read_losses(reader)
-        rows = inspect_topics(reader)
+        rows = inspect_topics(reader, STRETCH)
         for warning in [*reader.warnings, *losses]:    # reading finds what is damaged inside
             click.echo(f"warning: {warning}")
         click.echo(f"{'topic':<32} {'type':<44} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")
