@@ -23,6 +23,7 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import INCOMPLETE, ImuFusionError, ParameterError, TopicError
 from imu_fusion.kernels import is_compiling
+from imu_fusion.messages.transforms import TF_TYPE
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
@@ -50,6 +51,22 @@ def message_class(msgtype: str) -> type:
     except (ImportError, AttributeError, ValueError):
         raise TopicError(f"message type {msgtype} is not installed here; install the ROS package "
                          f"'{msgtype.split('/')[0]}' or leave its topics out") from None
+
+
+def output_class(msgtype: str) -> type:
+    """As :func:`message_class`, of an output.
+
+    Raises:
+        ParameterError: that of /tf is not installed; names the parameter that asks for it.
+    """
+    try:
+        return message_class(msgtype)
+    except TopicError:
+        if msgtype != TF_TYPE:
+            raise
+        raise ParameterError("parameter 'publish_tf': true needs tf2_msgs, which is not here; with "
+                             "an apt ROS: apt install ros-jazzy-tf2-msgs, else set publish_tf "
+                             "false (imu_fusion process writes /tf without it)") from None
 
 
 def descriptor(info: ParameterInfo) -> ParameterDescriptor:

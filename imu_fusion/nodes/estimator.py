@@ -8,7 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.nodes.base import IDLE, Node, message_class
+from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
 from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream
@@ -35,7 +35,7 @@ class EstimatorNode(Node):
         self._stream: Any = stream  # of the kind that the subclass has made
         self._flow = Flow(self, relays=True)
         self.problems = self._flow.problems
-        self._outputs = {topic: self._flow.output(message_class(msgtype), topic)
+        self._outputs = {topic: self._flow.output(output_class(msgtype), topic)
                          for topic, msgtype in outputs.items()}
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()

@@ -17,11 +17,10 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.errors import EstimationError, ImuFusionError, ParameterError, TopicError
+from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.messages.transforms import TF_TYPE
-from imu_fusion.nodes.base import IDLE, Node, message_class
+from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
@@ -43,18 +42,6 @@ _SLICE = 200  # messages published between callbacks
 
 def _latched(count):
     return reliable_qos(count, DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def _class_of(msgtype):
-    """As message_class; where that of /tf is missing, the parameter that asks for it is named."""
-    try:
-        return message_class(msgtype)
-    except TopicError:
-        if msgtype != TF_TYPE:
-            raise
-        raise ParameterError("parameter 'publish_tf': true needs tf2_msgs, which is not here; with "
-                             "an apt ROS: apt install ros-jazzy-tf2-msgs, else set publish_tf "
-                             "false (imu_fusion process writes /tf without it)") from None
 
 
 def _smooth_in_child(connection, file):
@@ -141,7 +128,7 @@ class SmootherNode(Node):
         # What is refused is refused before others see a reader of ours and wait for its answer.
         if smoothing_params.surface.file:
             load_surface(smoothing_params.surface.file)
-        types = {topic: _class_of(msgtype)
+        types = {topic: output_class(msgtype)
                  for topic, msgtype in outputs_of(smoothing_params).items()}
         self._stream = SmootherStream(smoothing_params, p.memory_limit * 1e6,
                                       self.get_logger().warning)
