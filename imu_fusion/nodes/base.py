@@ -1,8 +1,10 @@
 """What all nodes share: parameters from dataclasses, diagnostics, start and orderly end."""
 
 import importlib
+import math
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -33,6 +35,7 @@ from imu_fusion.signals import Interrupted, came, exit_code, handled, interrupt
 P = TypeVar("P", bound=Parameters)
 
 _WIDE = 2**31 - 1  # of a side without a bound: editors of parameters take no more
+FAREWELL = 2.0  # s, in which a node that was asked to stop ends its session
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
 # Parameters that belong to rclpy, not to us.
@@ -128,7 +131,7 @@ class Node(rclpy.node.Node):
             self._flow.wait(executor, seconds)
 
     def stop(self) -> None:
-        """Asked to end (signal): do what is needed until ``finished`` is true."""
+        """Asked to end (signal): do what is needed until ``finished`` is true; not for long."""
         self.finished = True
 
     def close(self) -> None:
@@ -285,11 +288,12 @@ def _run(node_class, params_files):
     node = node_class(params_files=params_files)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    stopping = False
+    deadline = math.inf
     try:
-        while rclpy.ok() and not node.finished and len(came) < 2:
-            if came and not stopping:
-                stopping = True
+        while (rclpy.ok() and not node.finished and len(came) < 2
+               and time.monotonic() < deadline):
+            if came and deadline == math.inf:
+                deadline = time.monotonic() + FAREWELL
                 node.stop()
             else:
                 node.wait(executor, node.work())

@@ -73,8 +73,8 @@ class OrientationOutputParams(Parameters):
                            doc="Gravity that remove_gravity_vector takes out.")
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
-    publish_tf: bool = param(False, doc="Also write the orientation to /tf, from fixed_frame to the "
-                             "frame of the Imu. The node needs tf2_msgs.")
+    publish_tf: bool = param(False, doc="Also write the orientation to /tf, from fixed_frame to "
+                             "the frame of the Imu. The node needs tf2_msgs.")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
 
 
