@@ -375,8 +375,9 @@ class OrientationStream(Stream):
     def _collect(self, stamps, values):
         """Samples for a calibration of the magnetometer, as often as they may be new."""
         usable = ~self._screen.saturated(values)
-        for k in self._calibration_pace.chosen(stamps[usable]):
-            self._calibrator.add(values[usable][k])
+        stamps, values = stamps[usable], values[usable]
+        for k in self._calibration_pace.chosen(stamps):
+            self._calibrator.add(values[k])
 
     def _write(self, rows):
         frame_id = self.frame_ids.get(IMU_TOPIC, "")
