@@ -48,13 +48,13 @@ ARROWS = {
               "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
               "messages", "sources", "sources.transports", "recordings", "streams",
               "compile_ahead", "signals"),
-    "batch": ("errors", "kernels", "messages", "recordings", "samples", "streams"),
+    "batch": ("errors", "kernels", "parameters", "messages", "recordings", "samples", "streams"),
     "report": ("errors", "kernels", "parameters", "geometry", "samples", "surfaces",
                "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
-               "evaluation", "messages", "recordings", "streams", "batch"),
-    "calibrate": ("errors", "geometry", "recordings", "sensors"),
+               "estimation.avalanche", "evaluation", "messages", "recordings", "streams", "batch"),
+    "calibrate": ("errors", "geometry", "recordings", "samples", "sensors"),
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
-              "batch", "report"),
+              "batch", "report", "calibrate"),
     "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",
             "compile_ahead", "nodes", "batch", "report", "calibrate", "demos",
             "signals"),
@@ -72,9 +72,10 @@ ARROWS_OF_FILES = {
 PURE = ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
         "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
         "estimation.avalanche", "evaluation", "sources")
-COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime",
-             "enum", "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib",
-             "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}
+COMPUTING = {"abc", "array", "bisect", "collections", "contextlib", "copy", "dataclasses",
+             "datetime", "enum", "functools", "heapq", "itertools", "math", "numbers", "operator",
+             "reprlib", "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag",
+             "pymap3d"}
 COMPUTING_OF_FILES = {
     "parameters/bounded_yaml.py": {"pathlib", "yaml"},
     "parameters/file.py": {"pathlib", "yaml"},

@@ -21,6 +21,7 @@ from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
+from imu_fusion.signals import end_after
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
@@ -46,7 +47,11 @@ def _latched(count):
 def _smooth_in_child(folder):
     """Entry point of the child process: its input lies in a folder, and there it leaves samples
     and their Outcome, or the reason why there are none."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end_after(parent.join)
     folder = Path(folder)
+    outcome: smoothing.Outcome | str
     try:
         params, logs = pickle.loads((folder / _INPUT).read_bytes())
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
@@ -144,6 +149,10 @@ class SmootherNode(Node):
         if turn.blocks:
             self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
                                for topic, messages in turn.blocks.items()})
+        if turn.ended:
+            self._stream.end([self._names[topic] for topic in turn.ended])
+        if turn.event:
+            self._stream.finish()    # a last sample after a long pause waits for one after it
         self._flow.finish(turn)
         if self._at_end and turn.event == END:
             self._insist(self._replay_broke_off(turn.over) or self._start())
