@@ -35,7 +35,7 @@ from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.surfaces.file import load_surface
 
 PRESET = Path(__file__).parent.parent / "config" / "avalanche.yaml"
-SEEDS, FRESH_SEEDS, WHOLE_SEEDS = 50, 10, 6
+SEEDS, FRESH_SEEDS, WHOLE_SEEDS = 50, 4, 6
 END = 8.99            # s, where the paper ends, before the gap
 FIX_SD = 0.2          # m, of fixes averaged over minutes
 WITHIN = 0.05         # s, of a transition
