@@ -5,6 +5,7 @@ wrong usage ends with 2; one that SIGINT, SIGTERM or SIGHUP has ended with 130, 
 something was lost, in a damaged recording or on the way, and the rest was used, the code is 3.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -67,8 +68,13 @@ class _NodeCommand(_ListingCommand):
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(imu_fusion.__version__)
-def cli() -> None:
+@click.option("--max-chunk-mb", type=click.FloatRange(min=1.0), metavar="MB",
+              help="Most that a chunk of a recording may unpack to.  [default: 256, or "
+                   "IMU_FUSION_MAX_CHUNK_MB]")
+def cli(max_chunk_mb: float | None) -> None:
     """Orientation, acceleration fields and trajectories from inertial sensors."""
+    if max_chunk_mb is not None:
+        os.environ["IMU_FUSION_MAX_CHUNK_MB"] = f"{max_chunk_mb:g}"    # of the nodes, too
 
 
 def _remaps(values):
@@ -182,7 +188,7 @@ def pipeline(bag: str, out: str, params_file: tuple[str, ...], without: tuple[st
 def info(bag: str, target: str | None) -> None:
     """What is in BAG: topics, rates, gaps, and what looks wrong."""
     from imu_fusion.recordings.bag_reader import open_bag
-    from imu_fusion.recordings.inspect import inspect_topics
+    from imu_fusion.recordings.inspect import STRETCH, inspect_topics
     from imu_fusion.recordings.losses import read_losses
     from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
@@ -190,7 +196,7 @@ def info(bag: str, target: str | None) -> None:
         click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s"
                    + (f", {reader.format}" if reader.format else ""))
         losses = read_losses(reader)
-        rows = inspect_topics(reader)
+        rows = inspect_topics(reader, STRETCH)
         for warning in [*reader.warnings, *losses]:    # reading finds what is damaged inside
             click.echo(f"warning: {warning}")
         click.echo(f"{'topic':<32} {'type':<44} {'messages':>9} {'rate Hz':>9} {'max gap s':>9}")

@@ -61,6 +61,7 @@ def test_what_a_page_names_exists(page, tmp_path):
     ("```\nx\n```", "language ''"),
     ("`imu_fusion demo nothing`", "no demo 'nothing'"),
     ("`config/none.yaml`", "no file"),
+    ("`test/test_docs.py::test_nothing`", "no function 'test_nothing'"),
     ("`imu_fusion.batch.proces`", "no such name"),
     ("`smoother/odometri`", "no topic or service"),
     ("`impact.trigggger`", "no parameter"),

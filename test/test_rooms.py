@@ -72,9 +72,10 @@ ARROWS_OF_FILES = {
 PURE = ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
         "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
         "estimation.avalanche", "evaluation", "sources")
-COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime",
-             "enum", "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib",
-             "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}
+COMPUTING = {"abc", "array", "bisect", "collections", "contextlib", "copy", "dataclasses",
+             "datetime", "enum", "functools", "heapq", "itertools", "math", "numbers", "operator",
+             "reprlib", "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag",
+             "pymap3d"}
 COMPUTING_OF_FILES = {
     "parameters/bounded_yaml.py": {"pathlib", "yaml"},
     "parameters/file.py": {"pathlib", "yaml"},

@@ -127,16 +127,18 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = Non
         nodes.wait("replayer", _PATIENCE)
         nodes.wait("recorder", _PATIENCE)
         domain = nodes.domain
+    refused, lost = find_left_out(bag, plan)
     with open_bag(out) as reader:
         found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
-        losses = read_losses(reader)
-    write_results(out, ({SMOOTHER: found[-1]} if found else {})
-                  | left_out(*_left_out(bag, plan, losses)))
+        lost += read_losses(reader)
+    write_results(out, ({SMOOTHER: found[-1]} if found else {}) | left_out(refused, lost))
     return domain
 
 
-def _left_out(bag, plan, losses):
-    """What the guards of the nodes have refused, by node, and what was lost, in words."""
+def find_left_out(bag: str | Path, plan: Plan
+                  ) -> tuple[dict[str, dict[str, dict[str, int]]], list[str]]:
+    """What the nodes of a pipeline leave out of a recording, by node and topic: reasons and how
+    many of each; and what of it cannot be read, in words."""
     refused = {}
     with open_bag(bag) as reader:
         for stage, names in plan.inputs.items():
@@ -150,4 +152,4 @@ def _left_out(bag, plan, losses):
                 found[topic] = guard.refused() | (
                     {UNDECODABLE: undecodable} if undecodable else {})
             refused[stage.node] = {topic: why for topic, why in found.items() if why}
-        return refused, [*(reader.warnings if reader.damaged else ()), *losses]
+        return refused, list(reader.warnings if reader.damaged else ())

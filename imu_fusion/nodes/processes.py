@@ -16,7 +16,7 @@ from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.kernels import NOTICE
 from imu_fusion.parameters.file import ParamsFile, files_of
-from imu_fusion.signals import Interrupted, came, held
+from imu_fusion.signals import LEASH, Interrupted, came, held
 
 _CLAIM = 9    # of the ports of a domain, the one that says that nodes will come
 _PATIENCE = 15.0  # s, in which nodes end their sessions and files
@@ -57,7 +57,8 @@ def _bound(port):
 
 
 class NodeProcesses:
-    """Processes of our nodes; leaving the context ends those that still run.
+    """Processes of our nodes; leaving the context ends those that still run, and so does the end of
+    this process, whatever ends it.
 
     Entering it compiles the kernels where that has not been done: nodes that compile would keep
     the others waiting, each for itself.
@@ -96,6 +97,8 @@ class NodeProcesses:
             for process in self._processes.values():
                 process.kill()
                 process.wait()
+                if process.stdin is not None:
+                    process.stdin.close()
             if self._claim is not None:
                 self._claim.close()
 
@@ -118,11 +121,11 @@ class NodeProcesses:
                 k: list(v) if isinstance(v, tuple) else v
                 for k, v in parameters.items() if v != ()}}}))
             command += ["--params-file", str(own)]
-        environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain),
-                           ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", PYTHONUNBUFFERED="1")
+        environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain), PYTHONUNBUFFERED="1",
+                           ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", **LEASH)
         with open(self._logs / f"{node}.log", "w") as log, held():
             self._processes[node] = subprocess.Popen(
-                command, env=environment, stdin=subprocess.DEVNULL,
+                command, env=environment, stdin=subprocess.PIPE,
                 stdout=None if show else log, stderr=None if show else subprocess.STDOUT,
                 start_new_session=True)
 

@@ -23,6 +23,7 @@ from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.transforms import TF_TYPE
 from imu_fusion.nodes.base import IDLE, Node, message_class
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
+from imu_fusion.signals import end_after
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
@@ -60,6 +61,9 @@ def _class_of(msgtype):
 def _smooth_in_child(connection, file):
     """Entry point of the child process: sends an Outcome and the number of samples, then these
     in pieces; or the reason why there are none."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end_after(parent.join)
     try:
         params, logs = pickle.loads(Path(file).read_bytes())
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):

@@ -35,6 +35,7 @@ _ENU_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _NO_FORCE = 0x7FFFFFFF    # as accelerometer_timestamp_relative
 _GAUSS = 1e-4
 _FIX_3D = 3
+_UTC = 1_000_000_000_000_000, 9_000_000_000_000_000    # us, of a receiver that knows it
 _READS = 200_000     # more than a step back of a message takes, byte by byte
 _WANTED = ["sensor_combined", "vehicle_magnetometer", "sensor_mag", "vehicle_gps_position",
            "sensor_gps", "vehicle_attitude"]
@@ -85,7 +86,11 @@ class Ulog(WholeSource):
         for dataset in log.data_list:
             if len(dataset.data.get("timestamp", ())):
                 sets.setdefault(dataset.name, dataset.data)
-        blocks = self._blocks(sets)
+        try:
+            blocks = self._blocks(sets)
+        except LookupError as error:
+            raise SampleError(f"{part}: its definitions are damaged: there is no {error}"
+                              ) from None
         if not blocks:
             raise SampleError(f"{part}: none of {', '.join(_WANTED)} was logged")
         return blocks
@@ -130,7 +135,7 @@ class Ulog(WholeSource):
         """UTC of boot in ns."""
         if gps is not None:
             utc, boot = (gps[n].astype(np.int64) for n in ("time_utc_usec", "timestamp"))
-            known = utc > 1_000_000_000_000_000
+            known = (utc > _UTC[0]) & (utc < _UTC[1]) & (boot >= 0) & (boot < _UTC[0])
             if known.any():
                 return int(np.median(utc[known] - boot[known])) * 1000
         self.remark("the receiver never knew UTC: stamps begin at an arbitrary instant")
