@@ -145,8 +145,8 @@ def process(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
         if name not in STAGES:
             raise TopicError(f"no estimator '{name}'; there are: {', '.join(STAGES)}")
     refuse_source(bag, out)
-    with open_bag(bag) as reader:
-        reports, chosen = _choose(reader, params_file, without, remap or {})
+    with open_bag(bag, remap=remap) as reader:
+        reports, chosen = _choose(reader, params_file, without)
         if not chosen:
             raise TopicError("nothing to do: " + "; ".join(
                 f"{r.node}: {r.skipped}" for r in reports))
@@ -186,7 +186,8 @@ def _found(reports: Sequence[StageReport]) -> dict[str, Any]:
 
 
 def estimate(bag: str | Path, nodes: Collection[str], params_file: ParamsFile = None,
-             keep: Collection[str] = ()) -> tuple[dict[str, StageReport], dict[str, list[bytes]]]:
+             keep: Collection[str] = (), remap: Mapping[str, str] | None = None
+             ) -> tuple[dict[str, StageReport], dict[str, list[bytes]]]:
     """What some estimators say of a recording, without writing it.
 
     Args:
@@ -194,6 +195,7 @@ def estimate(bag: str | Path, nodes: Collection[str], params_file: ParamsFile = 
         nodes: node names of estimators; one whose topics are missing is skipped.
         params_file: ParamsFile; None: defaults.
         keep: topics whose messages are wanted.
+        remap: topic names of ours to those in the recording.
 
     Returns:
         (StageReports by node name, CDR bytes of the topics in ``keep`` in order)
@@ -207,8 +209,8 @@ def estimate(bag: str | Path, nodes: Collection[str], params_file: ParamsFile = 
         if topic in kept:
             kept[topic].append(cdr)
 
-    with open_bag(bag) as reader:
-        reports, chosen = _choose(reader, params_file, STAGES.keys() - set(nodes), {})
+    with open_bag(bag, remap=remap) as reader:
+        reports, chosen = _choose(reader, params_file, STAGES.keys() - set(nodes))
         for _ in _run(reader, chosen, write, kept.keys()):
             pass
     return {report.node: report for report in reports}, kept
@@ -229,7 +231,7 @@ def _run(reader: Reader, chosen: Sequence[Chosen], write: Write,
         yield one
 
 
-def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageReport], list[Chosen]]:
+def _choose(reader: Reader, params_file, without) -> tuple[list[StageReport], list[Chosen]]:
     """A report per stage, and the stages that can run."""
     reports: list[StageReport] = []
     chosen: list[Chosen] = []
@@ -243,7 +245,7 @@ def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageRepo
         elif stage.unusable:
             report.skipped = stage.unusable
         else:
-            names, report.skipped = find_inputs(reader, *stage.input_types(), remap)
+            names, report.skipped = find_inputs(reader, *stage.input_types())
             if not report.skipped:
                 chosen.append((stage, report, names))
     return reports, chosen

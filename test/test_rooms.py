@@ -42,6 +42,7 @@ ARROWS = {
     "compile_ahead": ("errors", "kernels", "signals", "geometry", "samples", "surfaces",
                       "estimation.orientation", "estimation.acceleration_field",
                       "estimation.smoother", "messages", "streams"),
+    "arrays": ("errors", "geometry", "samples", "estimation.orientation"),
     "simulation": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
                    "estimation.acceleration_field"),
     "nodes": ("errors", "kernels", "parameters", "samples", "sensors", "surfaces",

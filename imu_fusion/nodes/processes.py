@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -65,7 +66,7 @@ class NodeProcesses:
 
     Args:
         logs: directory for what the nodes print, one file per node; a temporary
-            one if None.
+            one if None, which stays where something fails.
         domain: ROS domain id, a free one if None.
     """
 
@@ -74,6 +75,7 @@ class NodeProcesses:
         if domain is None:
             domain, self._claim = claim_domain()
         self.domain = domain
+        self._is_temporary = logs is None
         self._logs = Path(logs or tempfile.mkdtemp(prefix="imu_fusion_"))
         self._logs.mkdir(parents=True, exist_ok=True)
         self._processes: dict[str, subprocess.Popen] = {}
@@ -83,7 +85,7 @@ class NodeProcesses:
         compile_ahead(_say)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, kind: type[BaseException] | None, *_):
         try:
             for process in self._processes.values():
                 if process.poll() is None:
@@ -101,6 +103,8 @@ class NodeProcesses:
                     process.stdin.close()
             if self._claim is not None:
                 self._claim.close()
+            if self._is_temporary and (kind is None or issubclass(kind, Interrupted)):
+                shutil.rmtree(self._logs, ignore_errors=True)
 
     def start(self, node: str, show: bool = False, params_file: ParamsFile = None,
               **parameters: object) -> None:
@@ -168,7 +172,7 @@ class NodeProcesses:
 
     def _last_words(self, node):
         lines = self.log(node).strip().splitlines()
-        return " | ".join(lines[-3:]) or f"nothing in {self._logs / (node + '.log')}"
+        return f"{' | '.join(lines[-3:]) or 'it has printed above'} (logs: {self._logs})"
 
 
 def _say(text):

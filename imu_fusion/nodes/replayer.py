@@ -18,7 +18,7 @@ from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import DEPTH, END, NEXT, Flow, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.recordings.bag_reader import find_topic, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
 
 _BURST = 200  # messages sent before services and acknowledgements are looked at
 _BLOCKED = 0.05  # s, wait of the executor while nothing may be sent; callbacks end it
@@ -40,8 +40,10 @@ class ReplayerParams(Parameters):
     start_offset: float = param(0.0, doc="skip this much of the recording", unit="s", low=0)
     duration: float | None = param(None, doc="play this much of the recording", unit="s", low=0)
     loop: bool = param(False, doc="start again at the end")
-    topics: tuple[str, ...] = param((), doc="topics to play, * and ? permitted; empty: all")
-    exclude: tuple[str, ...] = param((), doc="topics to leave out, * and ? permitted")
+    topics: tuple[str, ...] = param((), doc="topics to play, by their recorded or their new names, "
+                                    "* and ? permitted; empty: all")
+    exclude: tuple[str, ...] = param((), doc="topics to leave out, by the names that they are "
+                                     "published by, * and ? permitted")
     remap: tuple[str, ...] = param((), doc="renamed topics, each as recorded:=published")
     clock: float = param(0.0, doc="rate of /clock in real time (at rate 0 in recorded time); "
                          "0: no /clock", unit="Hz", low=0)
@@ -69,7 +71,7 @@ class Replayer(Node):
         if not p.bag:
             raise ParameterError("parameter 'bag' of node replayer: no recording given; "
                                  "add -p bag:=PATH")
-        self._bag = open_bag(p.bag)
+        self._bag = open_bag(p.bag, remap=_remapping(p.remap))
         for warning in self._bag.warnings:
             self.get_logger().warning(warning)
         self._start = self._bag.start_time + round(p.start_offset * 1e9)
@@ -152,9 +154,8 @@ class Replayer(Node):
                   file=sys.stderr)
 
     def _make_publishers(self, p):
-        """Publishers of the selected topics, by recorded name."""
+        """Publishers of the selected topics, by name."""
         names = _selected(self._bag, p)
-        renamed = _remapping(self._bag, p.remap)
         publishers = {}
         for name in names:
             info = self._bag.topics[name]
@@ -166,7 +167,7 @@ class Replayer(Node):
                 self.get_logger().warning(f"{name} is not played: {error}")
                 continue
             latched = any(q["durability"] == "transient_local" for q in info.qos_profiles)
-            publishers[name] = self._flow.output(cls, renamed.get(name, name), reliable_qos(
+            publishers[name] = self._flow.output(cls, name, reliable_qos(
                 DEPTH, DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
         if not publishers:
             raise TopicError(f"{p.bag}: nothing to play; it has "
@@ -324,36 +325,35 @@ class Replayer(Node):
 
 
 def _selected(bag, p):
-    """Recorded names of the topics to play.
+    """Names of the topics to play.
 
     Raises:
         TopicError: one that was asked for is not there.
     """
-    def matches(name, patterns):
+    def matches(patterns, *names):
         return any(fnmatch.fnmatchcase(name.lstrip("/"), pattern.lstrip("/"))
-                   for pattern in patterns)
+                   for name in names for pattern in patterns)
+
+    def asked(name, patterns):
+        return matches(patterns, name, bag.recorded.get(name, name))
 
     for pattern in p.topics:
-        if not any(matches(name, [pattern]) for name in bag.topics):
+        if not any(asked(name, [pattern]) for name in bag.topics):
             bag.require(pattern)
     return [name for name in bag.topics
-            if (not p.topics or matches(name, p.topics)) and not matches(name, p.exclude)]
+            if (not p.topics or asked(name, p.topics)) and not matches(p.exclude, name)]
 
 
-def _remapping(bag, rules):
-    """{recorded name: published name}.
+def _remapping(rules):
+    """{published name: recorded name}.
 
     Raises:
-        ParameterError: a rule is malformed or its topic is not in the recording.
+        ParameterError: a rule is malformed.
     """
     renamed = {}
     for rule in rules:
         old, separator, new = rule.partition(":=")
-        name = find_topic(bag.topics, old)
-        if not separator or not new:
+        if not (old and separator and new):
             raise ParameterError(f"parameter 'remap': '{rule}' is not recorded:=published")
-        if name is None:
-            raise ParameterError(f"parameter 'remap': no topic '{old}' in the recording; it has: "
-                                 + ", ".join(bag.topics))
-        renamed[name] = new
+        renamed[new] = old
     return renamed

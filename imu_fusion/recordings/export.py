@@ -23,7 +23,7 @@ from imu_fusion.messages.layouts import (
     Layout,
 )
 from imu_fusion.recordings.bag_reader import Reader, open_bag
-from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.recordings.targets import make_parents, refuse_source, remove_empty
 
 _BLOCK = 2000    # messages that are decoded at once
 _XYZ = ("x", "y", "z")
@@ -84,7 +84,8 @@ _COLUMNS: tuple[Columns, ...] = (
 _TABLES = {columns[0].msgtype: columns for columns in _COLUMNS}
 
 
-def export(path: str | Path, out: str | Path, topics: Collection[str] = ()) -> dict[str, int]:
+def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
+           forms: Collection[str] = ()) -> dict[str, int]:
     """Write each topic that has numbers as a table.
 
     Args:
@@ -92,6 +93,7 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = ()) -> d
         out: folder to make: ``<topic>.csv``, a row for each message, with stamps in ns since 1970
             and in s since the first message of the recording; of poses also ``<topic>.tum`` (time,
             position, quaternion x y z w), of fixes ``<topic>.gpx``.
+        forms: those of csv, tum and gpx to write; all, if empty.
 
     Returns:
         dict of file name to number of rows.
@@ -104,25 +106,30 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = ()) -> d
     if out.exists():
         raise BagError(f"{out}: exists already; choose another folder")
     part = out.with_name(f".{out.name}.part-{os.getpid()}")
+    folders: list[Path] = []
     try:
-        part.mkdir(parents=True)
+        folders = make_parents(out)
+        part.mkdir()
         with open_bag(path) as reader:
             wanted = [reader.require(topic).name for topic in topics] or list(reader.topics)
             counts: dict[str, int] = {}
             for name in wanted:
                 if reader.topics[name].msgtype in _TABLES:
-                    counts |= _write(reader, name, part)
+                    counts |= _write(reader, name, part, forms)
         if not counts:
-            raise BagError(f"{path}: no topic that can be a table: {', '.join(sorted(_TABLES))}")
+            raise BagError(f"{path}: no topic that can be a table"
+                           + (f" of the form {' or '.join(forms)}" if forms else "")
+                           + f": {', '.join(sorted(_TABLES))}")
         os.rename(part, out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror})") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
+        remove_empty(folders)
     return counts
 
 
-def _write(reader: Reader, topic: str, folder: Path) -> dict[str, int]:
+def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> dict[str, int]:
     """{file: rows} of the files of one topic."""
     layout, names, values = _TABLES[reader.topics[topic].msgtype]
     stem = topic.strip("/").replace("/", "_")
@@ -131,6 +138,8 @@ def _write(reader: Reader, topic: str, folder: Path) -> dict[str, int]:
         suffixes[".tum"] = _Tum(layout)
     elif layout is FIX:
         suffixes[".gpx"] = _Gpx()
+    if forms:
+        suffixes = {suffix: form for suffix, form in suffixes.items() if suffix[1:] in forms}
     counts = {}
     with ExitStack() as stack:
         files = {suffix: stack.enter_context(open(folder / (stem + suffix), "w"))

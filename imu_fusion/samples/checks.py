@@ -33,6 +33,7 @@ _HALVES = 0.2       # share of messages that hold one half alone
 _TURNED = 0.2       # rad: more than a sensor at rest does
 _UPSIDE_DOWN = 0.9  # share of gravity along -z
 _FLAT_TOP = 3
+_COARSE = 15.0      # m: GNSS under trees or in streets states less
 _DISTINCT = 20
 
 
@@ -353,7 +354,21 @@ def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
     if null:
         result.append(Finding("fix", f"{name}: {null} positions are 0 deg, 0 deg: a receiver "
                                      "without a fix that says it has one; they are left out"))
-    return result
+    return result + _check_coarse(log[log.usable], name)
+
+
+def _check_coarse(log, name):
+    """Fixes that say of themselves that they are no GNSS."""
+    variance = np.trace(log.cov_enu[:, :2, :2], axis1=1, axis2=2) / 2
+    sd = np.sqrt(variance[variance > 0])
+    if not len(sd) or np.median(sd) < _COARSE:
+        return []
+    return [Finding("fix", f"{name}: the positions state standard deviations of {sd.min():.0f} to "
+                           f"{sd.max():.0f} m, {np.median(sd):.0f} m as a rule: of a telephone "
+                           "network or a receiver indoors, whose errors stay for minutes "
+                           "(gnss.position_error_sd). Places and speeds made of them are guesses: "
+                           "record under the open sky, or leave the trajectory out "
+                           "(--without smoother)")]
 
 
 def _s(count: int) -> str:

@@ -232,7 +232,7 @@ def test_types_that_are_not_installed_are_left_out_with_a_warning(graph, tmp_pat
     ({"bag": "/nowhere"}, BagError, "/nowhere"),
     ({"topics": ["/imu/dat"]}, TopicError, "no topic '/imu/dat'; it has: /imu/data_raw"),
     ({"remap": ["imu/data_raw"]}, ParameterError, "not recorded:=published"),
-    ({"remap": ["imu/x:=y"]}, ParameterError, "no topic 'imu/x'"),
+    ({"remap": ["imu/x:=y"]}, TopicError, "no topic 'imu/x'"),
     ({"start_offset": 7.0}, ParameterError, "beyond the end"),
     ({"rate": -1.0}, ParameterError, "'rate'.*-1.0 is out of bounds; allowed: at least 0"),
     ({"rate": "fast"}, ParameterError, "'rate'.*'fast' is not a number"),

@@ -20,8 +20,8 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from benchmarks.fuzz import KINDS, mutated, outcome, write_db3, write_mcap, write_ros1
-from imu_fusion.cli import INCOMPLETE, cli
-from imu_fusion.errors import BagError
+from imu_fusion.cli import cli
+from imu_fusion.errors import INCOMPLETE, BagError
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU
 from imu_fusion.messages.typestore import TYPES
