@@ -93,7 +93,7 @@ COMPUTING_OF_FILES = {
 }
 ROS = {"rclpy", "launch", "launch_ros", "ament_index_python", "rcl_interfaces", "rosgraph_msgs",
        "builtin_interfaces", "sensor_msgs", "geometry_msgs", "nav_msgs", "std_msgs", "std_srvs",
-       "diagnostic_msgs", "tf2_ros"}
+       "diagnostic_msgs"}
 # Imports by a name that is made at run time hide an arrow.
 HIDDEN = {"importlib", "imp", "pkgutil", "runpy"}
 HIDDEN_OF_FILES = {

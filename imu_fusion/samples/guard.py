@@ -143,8 +143,10 @@ class Guard:
             return False
         if stamp[0] < 0 or not np.isfinite(values).all():
             return False
+        if len(stamp) == 1:
+            return True
         step = stamp[1:] - stamp[:-1]
-        return not len(step) or bool(step.min() > 0 and step.max() <= JUMP)
+        return bool(step.min() > 0 and step.max() <= JUMP)
 
     def _follows(self, stamp: int, limit: int) -> bool:
         return self.last is None or 0 < stamp - self.last <= limit

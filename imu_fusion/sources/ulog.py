@@ -10,7 +10,7 @@ import io
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import SampleError
 from imu_fusion.samples.logs import FixLog, MagLog, PoseLog, VelocityLog
@@ -31,7 +31,8 @@ from imu_fusion.sources.source import (
 MAGIC = b"ULog\x01\x12\x35"
 ONBOARD_TOPIC = "onboard_ekf/pose"
 _FLU_FRD = np.array([1.0, -1.0, -1.0])
-_ENU_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_ENU_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRD_FLU = np.array([1.0, 0.0, 0.0, 0.0])    # half a turn about forward
 _NO_FORCE = 0x7FFFFFFF    # as accelerometer_timestamp_relative
 _GAUSS = 1e-4
 _FIX_3D = 3
@@ -126,8 +127,9 @@ class Ulog(WholeSource):
             quat = _vector(attitude, "q", 4)[:, [1, 2, 3, 0]]
             fine = np.linalg.norm(quat, axis=1) > 0.5
             stamp = _stamps(attitude["timestamp"], zero)[fine]
-            body = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])    # half a turn about forward
-            found = (_ENU_NED * Rotation.from_quat(quat[fine]) * body).as_quat()
+            world, ned, body = map(scipy.spatial.transform.Rotation.from_quat,
+                                   (_ENU_NED, quat[fine], _FRD_FLU))
+            found = (world * ned * body).as_quat()
             blocks += named({ONBOARD_TOPIC: PoseLog(stamp, found, np.zeros((len(stamp), 3)))})
         return blocks
 

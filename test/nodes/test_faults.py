@@ -134,3 +134,19 @@ def test_kill_9_of_a_command_ends_what_it_has_started(tmp_path, command):
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert not (tmp_path / "out").exists()    # and nothing of a recording that is not whole
+
+
+SWALLOWED = """
+import signal, sys
+from imu_fusion import nodes
+from imu_fusion.signals import came
+came.append(signal.SIGTERM)    # raised where an exception is not heard of, such as in a destructor
+sys.exit(nodes.main(["--ros-args", "-p", f"bag:={sys.argv[1]}"], "replayer"))
+"""
+
+
+def test_a_signal_on_the_way_to_the_node_is_not_forgotten(tmp_path):
+    faults.write_bag(tmp_path / "bag", 20)
+    done = subprocess.run([sys.executable, "-c", SWALLOWED, tmp_path / "bag"], timeout=120,
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGTERM, done
