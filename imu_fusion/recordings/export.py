@@ -13,6 +13,7 @@ import numpy as np
 from imu_fusion.errors import BagError
 from imu_fusion.geometry.rotation_arrays import rpy_angles
 from imu_fusion.messages.layouts import (
+    ACCEL,
     FIX,
     IMU,
     MAG,
@@ -33,10 +34,10 @@ def _axes(name: str, unit: str) -> list[str]:
     return [f"{name}_{axis} [{unit}]" for axis in _XYZ]
 
 
-def _diagonal(values: np.ndarray, field: slice, size: int = 3) -> np.ndarray:
-    """Standard deviations (n, 3) of the first three axes of covariances; NaN where unknown."""
+def _diagonal(values: np.ndarray, field: slice, size: int = 3, first: int = 0) -> np.ndarray:
+    """Standard deviations (n, 3) of three axes of covariances from one on; NaN where unknown."""
     cov = values[:, field].reshape(len(values), size, size)
-    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2)[:, :3], 0.0))
+    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2)[:, first:first + 3], 0.0))
     return np.where(sd > 0.0, sd, np.nan)
 
 
@@ -63,6 +64,12 @@ def _odometry(values: np.ndarray) -> np.ndarray:
         values[:, ODOMETRY["linear"]], values[:, ODOMETRY["angular"]]])
 
 
+def _accel(values: np.ndarray) -> np.ndarray:
+    return np.column_stack([
+        values[:, ACCEL["linear"]], _diagonal(values, ACCEL["covariance"], 6),
+        values[:, ACCEL["angular"]], _diagonal(values, ACCEL["covariance"], 6, first=3)])
+
+
 Columns = tuple[Layout, list[str], Callable[[np.ndarray], np.ndarray]]
 _QUATERNION = ["q_x", "q_y", "q_z", "q_w"]
 _ANGLES = ["roll [deg]", "pitch [deg]", "yaw [deg]"]
@@ -80,7 +87,10 @@ _COLUMNS: tuple[Columns, ...] = (
         [v[:, POSE["position"]], v[:, POSE["orientation"]],
          np.degrees(rpy_angles(v[:, POSE["orientation"]]))])),
     (ODOMETRY, [*_axes("position", "m"), *_axes("sd_position", "m"), *_QUATERNION, *_ANGLES,
-                *_axes("velocity_body", "m/s"), *_axes("angular_velocity", "rad/s")], _odometry))
+                *_axes("velocity_body", "m/s"), *_axes("angular_velocity", "rad/s")], _odometry),
+    (ACCEL, [*_axes("acceleration", "m/s^2"), *_axes("sd_acceleration", "m/s^2"),
+             *_axes("angular_acceleration", "rad/s^2"),
+             *_axes("sd_angular_acceleration", "rad/s^2")], _accel))
 _TABLES = {columns[0].msgtype: columns for columns in _COLUMNS}
 
 
