@@ -17,6 +17,8 @@ ros = ["ros-jazzy-rclpy>=7.1,<8", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-
 report = ["plotly>=5.15"]
 devices = ["pyubx2>=1.2.40", "pynmeagps>=1.0.40", "pyulog>=1.0", "python-calamine>=0.2.3"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
+# Brings matplotlib and sphinx along.
+calibrate = ["allantools>=2024.6"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
 docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
@@ -56,6 +58,7 @@ setup(
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
     extras_require={"ros": ros, "report": report, "devices": devices, "terrain": terrain,
+                    "calibrate": calibrate,
                     "peers": peers,
                     "oracles": oracles, "docs": docs, "test": test},
     entry_points={"console_scripts": [

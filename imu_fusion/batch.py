@@ -14,6 +14,7 @@ import numpy as np
 from imu_fusion.errors import BagError, ImuFusionError, SampleError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.layouts import Decoded, Layout
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
@@ -122,7 +123,7 @@ class _Feed:
             self._report.written[topic] += 1
 
 
-def process(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
+def process(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
             without: Collection[str] = (), remap: Mapping[str, str] | None = None,
             overwrite: bool = False, progress: Callable[[str], object] = lambda text: None,
             force: bool = False) -> tuple[list[StageReport], list[str]]:
@@ -131,7 +132,7 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
     Args:
         bag: path of a recording.
         out: rosbag2 directory to write.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
         overwrite: replace ``out``.
@@ -189,14 +190,14 @@ def _found(reports: Sequence[StageReport]) -> dict[str, Any]:
     return {FINDINGS: [*found]} if found else {}
 
 
-def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | None = None,
+def estimate(bag: str | Path, nodes: Collection[str], params_file: ParamsFile = None,
              keep: Collection[str] = ()) -> tuple[dict[str, StageReport], dict[str, list[bytes]]]:
     """What some estimators say of a recording, without writing it.
 
     Args:
         bag: path of a recording.
         nodes: node names of estimators; one whose topics are missing is skipped.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         keep: topics whose messages are wanted.
 
     Returns:

@@ -33,7 +33,8 @@ class _Group(click.Group):
             click.echo(f"imu_fusion: {error}", err=True)
             ctx.exit(1)
         except ModuleNotFoundError as error:
-            extra = {"rclpy": "ros", "plotly": "report"}.get((error.name or "").partition(".")[0])
+            extras = {"rclpy": "ros", "plotly": "report", "allantools": "calibrate"}
+            extra = extras.get((error.name or "").partition(".")[0])
             if extra is None:
                 raise
             click.echo(f"imu_fusion: this needs {error.name}: pip install 'imu_fusion[{extra}]'"
@@ -84,8 +85,9 @@ def _remaps(values):
 
 remap_option = click.option("--remap", multiple=True, metavar="TOPIC:=OTHER",
                             help="Use topic OTHER of the recording for TOPIC. Repeatable.")
-params_file_option = click.option("--params-file", type=click.Path(),
-                                  help="ROS 2 parameter file, keyed by node name.")
+params_file_option = click.option("--params-file", type=click.Path(), multiple=True, metavar="FILE",
+                                  help="ROS 2 parameter file, keyed by node name. Repeatable: the "
+                                       "last one that names a value counts.")
 without_option = click.option("--without", multiple=True, metavar="NODE",
                               help="Leave an estimator out. Repeatable.")
 overwrite_option = click.option("--overwrite", is_flag=True,
@@ -114,7 +116,7 @@ def start_node(node: str, arguments: tuple[str, ...]) -> None:
 @overwrite_option
 @click.option("--force", is_flag=True,
               help="Estimate even where the samples make it wrong (see info).")
-def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+def process(bag: str, out: str, params_file: tuple[str, ...], without: tuple[str, ...],
             remap: tuple[str, ...], overwrite: bool, force: bool) -> None:
     """Run the estimators on BAG without ROS and write the rosbag2 directory OUT.
 
@@ -152,7 +154,7 @@ def process(bag: str, out: str, params_file: str | None, without: tuple[str, ...
 @click.option("--report", "with_report", is_flag=True, help="Write OUT/report.html, too.")
 @remap_option
 @overwrite_option
-def pipeline(bag: str, out: str, params_file: str | None, without: tuple[str, ...],
+def pipeline(bag: str, out: str, params_file: tuple[str, ...], without: tuple[str, ...],
              with_report: bool, remap: tuple[str, ...], overwrite: bool) -> None:
     """Replay BAG through ROS 2 nodes, smooth it, record all of it into OUT.
 
@@ -271,6 +273,23 @@ def export(bag: str, out: str, topics: tuple[str, ...]) -> None:
 
 
 @cli.command()
+@click.argument("bag", type=click.Path())
+@click.argument("out", type=click.Path())
+@click.option("--crs", metavar="EPSG:CODE", help="Reference system of X and Y; without it they are "
+              "east and north of the origin.")
+@click.option("--interval", type=click.FloatRange(min=1e-3), default=0.1, show_default=True,
+              help="Seconds between rows.")
+def avaframe(bag: str, out: str, crs: str | None, interval: float) -> None:
+    """Write the smoothed trajectory in BAG as the CSV file OUT for AvaFrame.
+
+    Its comparison of particles reads these columns: X, Y, Z, ux, uy, uz, velocityMag, uAcc,
+    trajectoryLengthXY, trajectoryLengthXYZ, time.
+    """
+    from imu_fusion.recordings.avaframe import export_avaframe
+    click.echo(f"written: {out} with {export_avaframe(bag, out, crs, interval)} rows")
+
+
+@cli.command()
 @click.argument("source", type=click.Path())
 @click.option("--out", type=click.Path(), help="File to write; without it, the text is shown.")
 @click.option("--overwrite", is_flag=True, help="Replace it.")
@@ -340,7 +359,7 @@ def _ros_args(**values):
               help="Recording with imu/data or acceleration_field/*, if not in BAG.")
 @params_file_option
 @click.option("--out", type=click.Path(), default="report.html", show_default=True)
-def report(bag: str, estimates: str | None, params_file: str | None, out: str) -> None:
+def report(bag: str, estimates: str | None, params_file: tuple[str, ...], out: str) -> None:
     """Write an HTML report of BAG: what it holds, orientation, trajectory, how sure they are.
 
     The trajectory is smoothed for the report; the orientation, too, unless BAG (or the
@@ -349,7 +368,7 @@ def report(bag: str, estimates: str | None, params_file: str | None, out: str) -
     from imu_fusion.kernels import announced_compiling
     from imu_fusion.recordings.targets import refuse_files
     from imu_fusion.report.recording import write_recording_report
-    refuse_files([bag, estimates, params_file], out)
+    refuse_files([bag, estimates, *params_file], out)
     with announced_compiling(lambda text: click.echo(text, err=True)):
         complete = write_recording_report(bag, estimates, out, params_file).complete
     click.echo(f"written: {out}")
@@ -362,29 +381,100 @@ def calibrate() -> None:
     """Calibrate a sensor from a recording, as a parameter file."""
 
 
+out_option = click.option("--out", type=click.Path(), help="Parameter file to write.")
+imu_topic_option = click.option("--topic", default="imu/data_raw", show_default=True,
+                                help="Its topic in BAG.")
+
+
+def _show_calibration(title, rows, remarks, text, out):
+    """Print what a calibration says of itself; its parameter file goes to ``out`` or is shown."""
+    table = Table(title, "")
+    for name, value in rows:
+        table.add_row(name, value)
+    console.print(table)
+    for remark in remarks:
+        click.echo(f"warning: {remark}", err=True)
+    if out is None:
+        click.echo(text)
+    else:
+        try:
+            Path(out).write_text(text)
+        except OSError as error:
+            raise ParameterError(f"{out}: cannot be written ({error.strerror})") from None
+        click.echo(f"written: {out}")
+
+
+@calibrate.command("accelerometer")
+@click.argument("bag", type=click.Path())
+@imu_topic_option
+@out_option
+def calibrate_accelerometer(bag: str, topic: str, out: str | None) -> None:
+    """Matrix and bias from BAG, in which the sensor lay still in many poses.
+
+    The six sides up in turn, or a dozen poses in any directions, a second or more each;
+    rests are found by themselves. Gives calibration.acc_matrix and acc_bias.
+    """
+    from imu_fusion.calibrate import inertial
+    found, remarks = inertial.calibrate_recorded_accelerometer(bag, topic)
+    _show_calibration("accelerometer", inertial.linear_report("accelerometer", found), remarks,
+                      inertial.linear_parameters("accelerometer", found, bag), out)
+
+
+@calibrate.command("gyroscope")
+@click.argument("bag", type=click.Path())
+@imu_topic_option
+@click.option("--angle", type=float, metavar="DEG",
+              help="By which every turn went, about one axis: 360 for once round.")
+@out_option
+def calibrate_gyroscope(bag: str, topic: str, angle: float | None, out: str | None) -> None:
+    """Matrix and bias from BAG, in which the sensor was turned between rests.
+
+    About all axes, six turns or more, still for a second before and after each. Gravity
+    before and after tells what the rates must add up to. Gives calibration.gyro_matrix and
+    gyro_bias.
+    """
+    from imu_fusion.calibrate import inertial
+    found, remarks = inertial.calibrate_recorded_gyroscope(bag, topic, angle)
+    _show_calibration("gyroscope", inertial.linear_report("gyroscope", found), remarks,
+                      inertial.linear_parameters("gyroscope", found, bag), out)
+
+
+@calibrate.command("noise")
+@click.argument("bag", type=click.Path())
+@imu_topic_option
+@click.option("--mag-topic", default="imu/mag", show_default=True, help="Of the magnetometer.")
+@click.option("--plot", type=click.Path(), metavar="FILE.html", help="Write the Allan deviations.")
+@out_option
+def calibrate_noise(bag: str, topic: str, mag_topic: str, plot: str | None, out: str | None
+                    ) -> None:
+    """White noise, instability and walk from BAG, in which the sensor lay still.
+
+    By the Allan deviation, for the noise that the estimators take; half an hour or more, where
+    nobody walks.
+    """
+    from imu_fusion.calibrate import noise
+    found, remarks = noise.recorded_noise(bag, topic, mag_topic)
+    if plot is not None:
+        noise.write_plot(found, plot)
+        click.echo(f"written: {plot}")
+    _show_calibration("noise, x, y, z", [row for s in found for row in noise.noise_report(s)],
+                      remarks, noise.noise_parameters(found, bag), out)
+
+
 @calibrate.command("magnetometer")
 @click.argument("bag", type=click.Path())
 @click.option("--topic", default="imu/mag", show_default=True, help="Its topic in BAG.")
-@click.option("--out", type=click.Path(), help="Parameter file to write.")
+@out_option
 def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
     """Hard and soft iron from BAG, in which the sensor turned about all axes.
 
     Prints how well it is determined, and sensor.mag_offset and sensor.mag_matrix as the
     orientation estimator and the smoother take them.
     """
-    from imu_fusion import calibrate as calibration
-    found, remarks = calibration.calibrate_recorded_magnetometer(bag, topic)
-    table = Table("magnetometer", "")
-    for name, value in calibration.magnetometer_report(found):
-        table.add_row(name, value)
-    console.print(table)
-    for remark in remarks:
-        click.echo(f"warning: {remark}", err=True)
-    text = calibration.magnetometer_parameters(found, bag)
-    if out is None:
-        click.echo(text)
-    else:
-        Path(out).write_text(text)
+    from imu_fusion.calibrate import magnetometer
+    found, remarks = magnetometer.calibrate_recorded_magnetometer(bag, topic)
+    _show_calibration("magnetometer", magnetometer.magnetometer_report(found), remarks,
+                      magnetometer.magnetometer_parameters(found, bag), out)
 
 
 @cli.command(cls=_ListingCommand, listing=("Demos", DEMOS))

@@ -36,6 +36,8 @@ IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
 # Parameters that belong to rclpy, not to us.
 _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+# Groups that a calibration gives to every node (/**): one without that sensor passes by.
+_OF_SENSORS = ("sensor.", "calibration.")
 
 
 def message_class(msgtype: str) -> type:
@@ -161,6 +163,9 @@ class Node(rclpy.node.Node):
                                 if name not in known and name.startswith(self.OPEN_PREFIXES)}
         for name, value in self.open_parameters.items():
             self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
+        for_all = parameter_file.names_for_all(params_files)
+        given = {name: value for name, value in given.items() if name in known
+                 or not (name.startswith(_OF_SENSORS) and name in for_all)}
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"{unknown_parameter(unknown[0], self.PARAMETERS)} "

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from imu_fusion.errors import TopicError
 from imu_fusion.nodes.processes import NodeProcesses
+from imu_fusion.parameters.file import ParamsFile, files_of
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.logs import LogCollector
@@ -54,7 +55,7 @@ class Plan:
                 "wait_for_nodes": ("recorder", *self.estimators)}
 
 
-def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
+def plan_pipeline(bag: str | Path, params_file: ParamsFile = None,
                   without: Collection[str] = (), remap: Mapping[str, str] | None = None) -> Plan:
     """What a pipeline would do with a recording; arguments as of :func:`run_pipeline`.
 
@@ -87,7 +88,7 @@ def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
     return Plan(inputs, renamed, outdated)
 
 
-def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
+def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
                  without: Collection[str] = (), remap: Mapping[str, str] | None = None,
                  overwrite: bool = False, logs: str | Path | None = None,
                  show: bool = True) -> int:
@@ -98,7 +99,7 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         out: rosbag2 directory to write: the recording, with old estimates left out, and the
             new ones; results.json beside them as of ``batch.process``. Where a node fails there is
             no recording, and what ``overwrite`` was to replace stays.
-        params_file: ROS 2 parameter file for all nodes, or None for defaults.
+        params_file: ParamsFile, for all nodes; None: defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
         overwrite: replace ``out``.
@@ -113,16 +114,16 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     """
     refuse_source(bag, out)
     plan = plan_pipeline(bag, params_file, without, remap)
-    file = Path(params_file).absolute() if params_file else None
+    files = [Path(file).absolute() for file in files_of(params_file)]
     with NodeProcesses(logs) as nodes:
-        nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
+        nodes.start("recorder", params_file=files, out=str(Path(out).absolute()),
                     overwrite=overwrite, whole=True, end_with_sources=True,
                     expected_sources=(SMOOTHER,))
         for node in plan.estimators:
             own = {"smooth_at_end": True} if node == SMOOTHER else {}
-            nodes.start(node, show=show and node == SMOOTHER, params_file=file, qos="reliable",
+            nodes.start(node, show=show and node == SMOOTHER, params_file=files, qos="reliable",
                         **own)
-        nodes.start("replayer", show=show, params_file=file, **plan.replay_parameters(bag))
+        nodes.start("replayer", show=show, params_file=files, **plan.replay_parameters(bag))
         nodes.wait("replayer", _PATIENCE)
         nodes.wait("recorder", _PATIENCE)
         domain = nodes.domain

@@ -15,6 +15,7 @@ import yaml
 from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.kernels import NOTICE
+from imu_fusion.parameters.file import ParamsFile, files_of
 from imu_fusion.signals import Interrupted, came, held
 
 _CLAIM = 9    # of the ports of a domain, the one that says that nodes will come
@@ -98,19 +99,19 @@ class NodeProcesses:
             if self._claim is not None:
                 self._claim.close()
 
-    def start(self, node: str, show: bool = False, params_file: str | Path | None = None,
+    def start(self, node: str, show: bool = False, params_file: ParamsFile = None,
               **parameters: object) -> None:
         """Start a node.
 
         Args:
             node: module name in imu_fusion.nodes.
             show: let it print here instead of into its log.
-            params_file: ROS 2 parameter file.
+            params_file: ParamsFile.
             parameters: its parameters; empty tuples, which rclpy cannot read, are left out.
         """
         command = [sys.executable, "-m", "imu_fusion.cli", "run", node, "--ros-args"]
-        if params_file is not None:
-            command += ["--params-file", str(params_file)]
+        for file in files_of(params_file):
+            command += ["--params-file", str(file)]
         if parameters:
             own = self._logs / f"{node}.yaml"
             own.write_text(yaml.safe_dump({node: {"ros__parameters": {

@@ -172,6 +172,10 @@ class SmootherNode(Node):
         if turn.blocks:
             self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
                                for topic, messages in turn.blocks.items()})
+        if turn.ended:
+            self._stream.end([self._names[topic] for topic in turn.ended])
+        if turn.event:
+            self._stream.finish()    # a last sample after a long pause waits for one after it
         self._flow.finish(turn)
         if self._at_end and turn.event == END:
             self._insist(self._replay_broke_off(turn.over) or self._start())

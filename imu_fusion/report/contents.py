@@ -12,6 +12,7 @@ from imu_fusion.errors import TopicError
 from imu_fusion.messages.convert import attitude_log, bool_value
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.inspect import TopicReport, inspect_topics
 from imu_fusion.report.orientation_status import Status
@@ -100,13 +101,13 @@ def read_estimates(path: str | Path) -> Estimates:
                            for name, msgtype in _ESTIMATES.items() if _has(reader, name, msgtype)})
 
 
-def make_estimates(bag: str | Path, params_file: str | Path | None, with_orientation: bool
+def make_estimates(bag: str | Path, params_file: ParamsFile, with_orientation: bool
                    ) -> tuple[Estimates, StageReport]:
     """What ``process`` would say of a recording: Estimates, and the smoother's StageReport.
 
     Args:
         bag: recording.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         with_orientation: whether the orientation is estimated, too.
     """
     nodes = [SMOOTHER, *([ORIENTATION] if with_orientation else [])]

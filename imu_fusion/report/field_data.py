@@ -12,6 +12,7 @@ from imu_fusion.estimation.acceleration_field.rows import ROW, SATURATED, field_
 from imu_fusion.estimation.acceleration_field.sensor_array import AccelerometerParams
 from imu_fusion.messages.convert import attitude_log
 from imu_fusion.messages.layouts import ACCEL, IMU
+from imu_fusion.parameters.file import ParamsFile, files_of
 from imu_fusion.recordings.bag_reader import find_topic, open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.results import read_results
@@ -82,13 +83,13 @@ class FieldData:
 
 
 def read_field(bag: str | Path, estimates: str | Path,
-               params_file: str | Path | None = None) -> FieldData | None:
+               params_file: ParamsFile = None) -> FieldData | None:
     """FieldData of a recording and of the one with its estimates; None if it holds none.
 
     Args:
         bag: recording with the accelerometers.
         estimates: recording with acceleration_field/imu and acceleration_field/accel.
-        params_file: parameter file of the estimator, or None: then nothing is known of the
+        params_file: ParamsFile of the estimator; None: then nothing is known of the
             accelerometers.
     """
     with open_bag(estimates) as reader:
@@ -110,7 +111,7 @@ def read_field(bag: str | Path, estimates: str | Path,
                 rows["flags"][(np.abs(reading) >= limit).any(axis=1)] |= SATURATED
     found = read_results(estimates)
     beside = {} if found is None else found.get(NODE, {})
-    if found is None and params_file is not None:
+    if found is None and files_of(params_file):
         impacts = measure_impacts(rows, config.field.points, config.field.gravity,
                                   config.stream.impact)
     else:

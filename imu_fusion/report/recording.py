@@ -14,7 +14,9 @@ from imu_fusion.evaluation.orientation_error import (
     moving_at,
     orientation_errors,
 )
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.report.acceleration_field import field_sections
+from imu_fusion.report.avalanche import slope_of, slope_section
 from imu_fusion.report.contents import (
     ESTIMATES,
     FIX_TOPIC,
@@ -127,7 +129,7 @@ class _Material:
 
 
 def write_recording_report(bag: str | Path, estimates: str | Path | None, path: str | Path,
-                           params_file: str | Path | None = None) -> Written:
+                           params_file: ParamsFile = None) -> Written:
     """Write the HTML report of a recording; its trajectory is what ``process`` would make of it.
 
     Args:
@@ -137,7 +139,7 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
             so. None: those in ``bag``, or else made from it. ``acceleration_field/*`` in it
             get their sections, too.
         path: HTML file to write.
-        params_file: ROS 2 parameter file of the estimators, or None for defaults.
+        params_file: ParamsFile of the estimators; None: defaults.
 
     Returns:
         Written.
@@ -208,6 +210,9 @@ def _estimates(material) -> list[Section]:
         in_world = m.is_truth and m.smoothed.surface is not None \
             and np.any(m.reference.position_world)
         sections += smoother_sections(m.smoothed, m.reference if in_world else None)
+        slope = slope_of(m.smoothed, m.raw)
+        if slope is not None:
+            sections.insert(1, slope_section(slope, contents.log(MAGNETOMETER)))
     if m.estimate is not None:
         sections.append(orientation_section(m.estimate, m.origin, m.reference,
                                             contents.reference_name or "", m.shades))

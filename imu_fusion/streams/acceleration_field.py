@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
 from imu_fusion.parameters.declare import Parameters, flatten, param
-from imu_fusion.parameters.file import node_values
+from imu_fusion.parameters.file import ParamsFile, node_values, source_of
 from imu_fusion.samples import AccelerometerLog, ImuLog
 from imu_fusion.samples.blocks import Samples
 from imu_fusion.samples.matching import SampleMatcher
@@ -283,8 +282,8 @@ def _impacts(config, rows):
 NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, FieldStreamParams)
 
 
-def read_configuration(params_file: str | Path | None) -> FieldConfiguration:
-    """The FieldConfiguration in a parameter file (or None).
+def read_configuration(params_file: ParamsFile) -> FieldConfiguration:
+    """The FieldConfiguration in a ParamsFile.
 
     Raises:
         ParameterError, LayoutError: with the name of what is wrong.
@@ -293,7 +292,7 @@ def read_configuration(params_file: str | Path | None) -> FieldConfiguration:
     values = node_values(NODE, params_file, FieldConfiguration.names() | old)
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
-    return FieldConfiguration.from_mapping(values, str(params_file or ""))
+    return FieldConfiguration.from_mapping(values, source_of(params_file))
 
 
 def _configure(stage, params_file):

@@ -33,6 +33,7 @@ from imu_fusion.samples import ImuLog, MagLog, checks
 from imu_fusion.samples.blocks import Samples, joined
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.turning import check_axes, check_turning
+from imu_fusion.sensors.linear_calibration import ImuCalibration
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
@@ -64,7 +65,7 @@ _CALIBRATION_INTERVAL = 50_000_000  # ns; turning sensors show a new direction a
 
 @dataclass(frozen=True)
 class OrientationOutputParams(Parameters):
-    """What is done with an orientation before it is published."""
+    """What surrounds the estimator: samples before it, its orientation before it is published."""
 
     remove_gravity_vector: bool = param(
         False, doc="Publish imu/data with gravity taken out of the linear acceleration.")
@@ -75,6 +76,7 @@ class OrientationOutputParams(Parameters):
     publish_tf: bool = param(False, doc="Also broadcast the orientation as the transform from "
                              "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
+    calibration: ImuCalibration = ImuCalibration()
 
 
 def _without_lost(acc, had_force):
@@ -240,7 +242,7 @@ class OrientationStream(Stream):
         self.estimator = OrientationEstimator(params)
         self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
         self._calibration_pace = _Pace(_CALIBRATION_INTERVAL)
-        super().__init__(INPUTS, warn)
+        super().__init__(INPUTS, warn, output.calibration)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
         self._writer = _Writer(self.params, self.output)

@@ -37,6 +37,7 @@ from imu_fusion.samples import checks
 from imu_fusion.samples.blocks import Samples, joined
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.turning import check_axes
+from imu_fusion.sensors.linear_calibration import ImuCalibration
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 from imu_fusion.surfaces.file import load_surface
@@ -100,6 +101,7 @@ class SmoothingParams(SmootherParams):
         False, doc="First recover rates beyond the gyroscope's range from the magnetometer, as the "
         "orientation estimator does on a whole recording, and take them with their covariance. "
         "Set it for a body that tumbles beyond the range.")
+    calibration: ImuCalibration = ImuCalibration()
     surface: SurfaceFile = SurfaceFile()
     frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
@@ -160,7 +162,7 @@ class SmootherStream(Stream):
                  warn: Callable[[str], object] = lambda text: None) -> None:
         self.params = params
         self.limit = limit
-        super().__init__(INPUTS, warn)
+        super().__init__(INPUTS, warn, params.calibration)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
         self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
