@@ -27,7 +27,7 @@ ADAPTATION = np.dtype([
 _EXPECTED = 1.5     # mean square of a channel's innovation that is no excess, in its variances
 _CHANCE = 6.0       # summed excess of twelve channels that chance makes once in many days
 _SLOWNESS = 20.0    # excess that makes a variance e times larger
-_ALTERNATING = -0.3   # correlation of innovations with those before, below which they are noise
+_ALTERNATING = -0.15   # correlation of innovations with those before, below which they are noise
 GRACE = 30          # samples after a start or a gap, in which linearisation is to blame
 _MEMORY = 0.9       # of products, from sample to sample
 
@@ -49,9 +49,9 @@ def summed(total, squares, largest):
 
 
 @njit
-def alternates(adaptation):
-    """Whether innovations change their signs: noise."""
-    return bool(adaptation.product < _ALTERNATING * adaptation.square)
+def alternates(adaptation, times):
+    """Whether innovations change their signs, so many ``times`` as clearly as noise does."""
+    return bool(adaptation.product < times * _ALTERNATING * adaptation.square)
 
 
 @njit
@@ -64,11 +64,12 @@ def note(adaptation, kind, excess):
 
 
 @njit
-def adapt_noise(adaptation, squares, contradiction, innovation, last):
+def adapt(adaptation, squares, contradiction, watched, innovation, last):
     """Take one sample.
 
     Args:
         adaptation: ADAPTATION, changed.
+        watched: whether it was enough for the motion to be watched; else its innovations tell.
         squares: mean of the squares of its innovations, in units of their variances.
         contradiction: mean square of what no rigid motion explains, in units of the noise of the
             parameters.
@@ -84,7 +85,12 @@ def adapt_noise(adaptation, squares, contradiction, innovation, last):
     if adaptation.grace > 0:
         adaptation.grace -= 1
         return
-    if not alternates(adaptation):
-        squares = min(squares, contradiction / factor(adaptation.noise))
-    adaptation.noise = summed(adaptation.noise, squares, squares * factor(adaptation.noise))
+    noise = squares
+    if not alternates(adaptation, 1.0):
+        noise = min(squares, contradiction / factor(adaptation.noise))
+    adaptation.noise = summed(adaptation.noise, noise, noise * factor(adaptation.noise))
+    if not watched:
+        motion = squares / max(noise, 1.0)
+        adaptation.motion = summed(adaptation.motion, motion, motion * factor(adaptation.motion))
+        note(adaptation, 1, adaptation.motion)
     note(adaptation, 0, adaptation.noise)

@@ -159,8 +159,9 @@ def cross_check(state, p, channels, reading, at, work):
             work.innovation[c] = innovation_of(
                 reading[c], work.expected[c], work.entries[c], work.touched[c], work.row[c],
                 state.x, at)
-    if work.fit.redundancy[0] > 0:
+    if work.fit.redundancy[0] >= 0:
         _allow(state, p, channels, reading, work)
+    if work.fit.redundancy[0] > 0:
         worst = _worst(work.fit, work)
         while worst > _GATE * _GATE and _leave_out(state, channels, work, worst, p):
             worst = _worst(work.fit, work)
@@ -199,7 +200,7 @@ def linearise_well(state, p, channels, at, work):
         spin += cov[OMEGA + i, OMEGA + i]
         force += cov[ACC + i, ACC + i]
         turning += cov[ALPHA + i, ALPHA + i]
-    if fit.redundancy[0] > 0:
+    if fit.redundancy[0] >= 0:
         by_fit = np.zeros(6)
         for i in range(6):
             for c in range(len(channels)):

@@ -17,7 +17,12 @@ from imu_fusion.estimation.acceleration_field.adaptation import (
     summed,
 )
 from imu_fusion.estimation.acceleration_field.measurement import noise_variance
-from imu_fusion.estimation.acceleration_field.motion_model import OMEGA, add_motion_noise
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ACC,
+    ALPHA,
+    OMEGA,
+    add_motion_noise,
+)
 from imu_fusion.kernels import njit
 
 # Columns of ADAPTATION's ``tracked``: a component, its rate, variances of both, their covariance.
@@ -41,35 +46,57 @@ def watch_motion(state, p, channels, reading, step, work):
         return
     values, variances = np.zeros(6), np.zeros(6)
     _fit_readings(state, p, channels, reading, fit, values, variances)
+    tracked = adaptation.tracked
     goes_on = step.dt[0] > 0.0
     for c in range(len(channels)):
         goes_on &= state.fitted[c] == fit.used[c]
         state.fitted[c] = fit.used[c]
+    for i in range(6):
+        if goes_on:
+            _go_on(tracked[i], i, step)
+            _add(tracked[i], i, p, step, factor(adaptation.motion))
+        else:
+            _start(tracked[i], i, state, p, values[i], work)
+    if step.dt[0] > 0.0:
+        _judge(state, p, step, values, variances)
+    for i in range(6):
+        _correct(tracked[i], values[i], variances[i])
+
+
+@njit
+def _start(own, i, state, p, value, work):
+    """Begin to follow component i, whose fit is ``value``, where the filter predicts it."""
+    at, unit = (ACC + i, 1.0) if i < 3 else (ALPHA + i - 3, p.radius)
+    own[_VALUE], own[_RATE] = value, unit * state.x[at + 3]
+    own[_VV] = unit * unit * state.cov[at, at]
+    own[_VR] = unit * unit * state.cov[at, at + 3]
+    own[_RR] = unit * unit * state.cov[at + 3, at + 3]
+    for c in range(len(work.innovation)):
+        own[_VALUE] -= work.fit.solve[i, c] * work.innovation[c]
+        own[_VV] += work.fit.solve[i, c] * work.fit.solve[i, c] * work.variance[c]
+
+
+@njit
+def _judge(state, p, step, values, variances):
+    """Take the densities to be larger by what the fit (6,), with variances (6,) of its noise, is
+    off from what is predicted of it; widen all predictions by that."""
+    adaptation = state.adaptation[0]
     tracked = adaptation.tracked
-    if not goes_on:
-        for i in range(6):
-            unit, spread = (1.0, p.spread[3]) if i < 3 else (p.radius, p.spread[1])
-            tracked[i, _VALUE], tracked[i, _RATE] = values[i], 0.0
-            tracked[i, _VV], tracked[i, _VR] = variances[i], 0.0
-            tracked[i, _RR] = (unit * spread) ** 2
-        return
     before = factor(adaptation.motion)
     squares, largest = 0.0, 1.0
     for i in range(6):
-        _go_on(tracked[i], i, step)
-        _add(tracked[i], i, p, step, before)
         square, total = (values[i] - tracked[i, _VALUE]) ** 2, tracked[i, _VV] + variances[i]
         squares += square / total / 6.0
         largest = max(largest, before + (square - total) / _noise(i, p, step)[0])
-    if not alternates(adaptation):
+    # Chance must not hide the onset of an impact.
+    if not alternates(adaptation, 2.0):
         adaptation.motion = summed(adaptation.motion, squares, largest)
         note(adaptation, 1, adaptation.motion)
     wilder = max(factor(adaptation.motion) - before, 0.0)
     if wilder > 0.0:
         add_motion_noise(state.cov, p, step, wilder)
-    for i in range(6):
-        _add(tracked[i], i, p, step, wilder)
-        _correct(tracked[i], values[i], variances[i])
+        for i in range(6):
+            _add(tracked[i], i, p, step, wilder)
 
 
 @njit

@@ -4,11 +4,7 @@ import math
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.adaptation import (
-    ADAPTATION,
-    GRACE,
-    adapt_noise,
-)
+from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION, GRACE, adapt
 from imu_fusion.estimation.acceleration_field.cross_check import (
     CHECK,
     contradiction,
@@ -94,8 +90,8 @@ def _correct(state, p, channels, reading, at, is_predicted, step, work, trace, n
         linearise_well(state, p, channels, at, work)
     found = update(state, p, channels, reading, at, work, trace, n)
     if found.used > 0 and p.is_adaptive:
-        adapt_noise(state.adaptation[0], found.squares / found.used,
-                    contradiction(p, channels, work), work.innovation, state.innovation)
+        adapt(state.adaptation[0], found.squares / found.used, contradiction(p, channels, work),
+              work.fit.redundancy[0] >= 0, work.innovation, state.innovation)
     return found
 
 
