@@ -17,7 +17,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 
 _IMU, _MAG = "imu/data_raw", "imu/mag"
 _FLICKER = 0.664       # of the bias instability, is the lowest deviation
-_SHORTEST = 30.0       # s, for anything
+_SHORTEST = 5.0        # s, for white noise
 _LONG = 1800.0         # s, for an instability and a walk that mean something
 _FEWEST = 9            # averages, of which a deviation is known to some 20 %
 _WHITE = (-0.65, -0.35)    # slopes of the deviation that pass for white noise,
@@ -30,7 +30,7 @@ _AXES = "xyz"
 class NoiseOfSensor:
     """``name``; ``unit`` of a sample; ``tau`` (k,) s and ``deviation`` (k, 3) of Allan; ``density``
     (3,) unit/sqrt(Hz) of white noise; ``instability`` (3,) unit; ``walk`` (3,) unit/sqrt(s), nan
-    where the recording is too short to show one; ``sample_sd`` (3,) of one sample."""
+    where the recording is too short to show one; ``mean`` and ``sample_sd`` (3,) of the samples."""
 
     name: str
     unit: str
@@ -39,6 +39,7 @@ class NoiseOfSensor:
     density: np.ndarray
     instability: np.ndarray
     walk: np.ndarray
+    mean: np.ndarray
     sample_sd: np.ndarray
 
 
@@ -67,7 +68,7 @@ def noise_of(name: str, unit: str, values: np.ndarray, rate: float) -> NoiseOfSe
     for k in range(3):
         density[k], instability[k], walk[k] = _read_off(tau, deviation[:, k])
     return NoiseOfSensor(name, unit, tau, deviation, density, instability, walk,
-                         values.std(axis=0))
+                         values.mean(axis=0), values.std(axis=0))
 
 
 def _read_off(tau, deviation):
@@ -136,7 +137,8 @@ def noise_report(found: NoiseOfSensor) -> list[tuple[str, str]]:
     return [(f"{found.name}: white noise, {unit}/sqrt(Hz)", three(found.density)),
             (f"{found.name}: instability of the bias, {unit}", three(found.instability)),
             (f"{found.name}: walk of the bias, {unit}/sqrt(s)", three(found.walk)),
-            (f"{found.name}: one sample, {unit}", three(found.sample_sd))]
+            (f"{found.name}: one sample, {unit}", three(found.sample_sd)),
+            (f"{found.name}: mean, {unit}", three(found.mean))]
 
 
 def noise_parameters(found: list[NoiseOfSensor], bag: str | Path) -> str:

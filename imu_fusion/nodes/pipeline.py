@@ -34,7 +34,7 @@ class Plan:
     Attributes:
         inputs: of the estimators that have work to do, the smoother among them: their topics to
             those of the recording.
-        renamed: topics of the recording that are played under names of ours.
+        renamed: topics that are played under other names than those in the recording, to these.
         outdated: topics of the recording with earlier estimates, which are not played.
     """
 
@@ -50,7 +50,7 @@ class Plan:
     def replay_parameters(self, bag: str | Path) -> dict:
         """Parameters of the replayer: at full speed, once all nodes have joined."""
         return {"bag": str(Path(bag).absolute()), "rate": 0.0, "exclude": self.outdated,
-                "remap": tuple(f"{name}:=/{topic}" for name, topic in self.renamed.items()),
+                "remap": tuple(f"{name}:={topic}" for topic, name in self.renamed.items()),
                 "wait_for_subscribers": 0,
                 "wait_for_nodes": ("recorder", *self.estimators)}
 
@@ -68,24 +68,22 @@ def plan_pipeline(bag: str | Path, params_file: ParamsFile = None,
             raise TopicError(f"no estimator '{name}' to leave out; there are: "
                              + ", ".join(node for node in STAGES if node != SMOOTHER))
     inputs: dict[Stage, Mapping[str, str]] = {}
-    renamed: dict[str, str] = {}
     made: set[str] = set()
-    with open_bag(bag) as reader:
+    with open_bag(bag, remap=remap) as reader:
         for stage in STAGES.values():
             # Here, for a bad file to be refused before anything starts.
             stage, _ = stage.prepare(params_file)
             if stage.node in without or stage.unusable:
                 continue
-            names, missing = find_inputs(reader, *stage.input_types(), remap or {})
+            names, missing = find_inputs(reader, *stage.input_types())
             if missing and stage.node == SMOOTHER:
                 raise TopicError(f"nothing to smooth: {missing}")
             if missing:
                 continue
             inputs[stage] = names
             made |= stage.outputs.keys()
-            renamed |= {name: topic for topic, name in names.items() if name.lstrip("/") != topic}
         outdated = tuple(name for name in reader.topics if name.lstrip("/") in made)
-    return Plan(inputs, renamed, outdated)
+        return Plan(inputs, dict(reader.recorded), outdated)
 
 
 def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
@@ -127,18 +125,20 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = Non
         nodes.wait("replayer", _PATIENCE)
         nodes.wait("recorder", _PATIENCE)
         domain = nodes.domain
+    refused, lost = find_left_out(bag, plan)
     with open_bag(out) as reader:
         found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
-        losses = read_losses(reader)
-    write_results(out, ({SMOOTHER: found[-1]} if found else {})
-                  | left_out(*_left_out(bag, plan, losses)))
+        lost += read_losses(reader)
+    write_results(out, ({SMOOTHER: found[-1]} if found else {}) | left_out(refused, lost))
     return domain
 
 
-def _left_out(bag, plan, losses):
-    """What the guards of the nodes have refused, by node, and what was lost, in words."""
+def find_left_out(bag: str | Path, plan: Plan
+                  ) -> tuple[dict[str, dict[str, dict[str, int]]], list[str]]:
+    """What the nodes of a pipeline leave out of a recording, by node and topic: reasons and how
+    many of each; and what of it cannot be read, in words."""
     refused = {}
-    with open_bag(bag) as reader:
+    with open_bag(bag, remap=plan.renamed) as reader:
         for stage, names in plan.inputs.items():
             found = {}
             for topic, name in names.items():
@@ -150,4 +150,4 @@ def _left_out(bag, plan, losses):
                 found[topic] = guard.refused() | (
                     {UNDECODABLE: undecodable} if undecodable else {})
             refused[stage.node] = {topic: why for topic, why in found.items() if why}
-        return refused, [*(reader.warnings if reader.damaged else ()), *losses]
+        return refused, list(reader.warnings if reader.damaged else ())

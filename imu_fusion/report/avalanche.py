@@ -123,8 +123,9 @@ def slope_section(slope: Slope, mag: MagLog | None) -> Section:
         Figure(time_figure(_velocity(slope), slope.shades, 150),
                "Velocity in the slope frame; the phases are shaded."),
         Figure(time_figure(_rotation(slope), slope.shades, 170),
-               "Rotation vector since the entrainment (23), without jumps, and the rates as "
-               "recorded and with what was recovered beyond the gyroscope's range."),
+               "Rotation vector since the entrainment (23), each the nearest to the one before: "
+               "where a wobbling ball passes a whole turn beside its axis, none is near. Turns, "
+               "and the rates as recorded and with what was recovered beyond the range."),
         Figure(time_figure(_forces(slope), slope.shades, 150),
                "Specific force of the ball's centre. In free flight it is zero: those spans are "
                "what the table of flights lists.")]

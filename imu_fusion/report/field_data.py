@@ -1,5 +1,6 @@
 """What the report needs of an acceleration field: estimates and readings, read from recordings."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,7 +84,8 @@ class FieldData:
 
 
 def read_field(bag: str | Path, estimates: str | Path,
-               params_file: ParamsFile = None) -> FieldData | None:
+               params_file: ParamsFile = None,
+               remap: Mapping[str, str] | None = None) -> FieldData | None:
     """FieldData of a recording and of the one with its estimates; None if it holds none.
 
     Args:
@@ -91,6 +93,7 @@ def read_field(bag: str | Path, estimates: str | Path,
         estimates: recording with acceleration_field/imu and acceleration_field/accel.
         params_file: ParamsFile of the estimator; None: then nothing is known of the
             accelerometers.
+        remap: topic names of ours to those in ``bag``.
     """
     with open_bag(estimates) as reader:
         if any(find_topic(reader.topics, t) is None for t in (IMU_TOPIC, ACCEL_TOPIC)):
@@ -103,7 +106,7 @@ def read_field(bag: str | Path, estimates: str | Path,
         return None
     rows = _rows(shared, imu[i], covs[i], values[j])
     config = read_configuration(params_file)
-    readings, gyr = _measured(bag, config, rows["stamp"])
+    readings, gyr = _measured(bag, config, rows["stamp"], remap)
     for name, reading in readings.items():
         limit = config.accelerometers[name].completed(config.field.sensor).range
         if limit is not None:
@@ -147,11 +150,11 @@ def _rows(stamps, imu, covs, accel):
     return rows
 
 
-def _measured(bag, config, stamps):
+def _measured(bag, config, stamps, remap):
     """Readings of the accelerometers and the gyroscope at the stamps of the estimates."""
     readings, gyr = {}, None
     tolerance = int(round(config.stream.match.tolerance * 1e9))
-    with open_bag(bag) as reader:
+    with open_bag(bag, remap=remap) as reader:
         for name in config.accelerometers:
             topic = f"accelerometers/{name}"
             if find_topic(reader.topics, topic) is not None:

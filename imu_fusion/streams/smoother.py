@@ -288,10 +288,13 @@ class Outcome:
     def of(cls, result: SmootherResult, frame_id: str) -> Self:
         """Of a SmootherResult."""
         numbers: dict[str, Any] = {
-            "samples": len(result.samples), "iterations": result.iterations,
+            "samples": len(result.samples), "origin": asdict(result.frame),
+            "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
             "adapted": result.adapted, "noise": result.noise,
+            "states": {name: {"value": value.tolist(), "sd": sd.tolist()}
+                       for name, (value, sd) in constant_states(result.states).items()},
             "outliers": {name: asdict(found) for name, found in result.outliers().items()}}
         if result.gnss_step is not None:
             numbers["gnss_step"] = {"stamp": result.gnss_step.stamp,
@@ -314,6 +317,15 @@ class Outcome:
             stamp, world, _NAME, self.summary,
             {key: json.dumps(value) for key, value in self.numbers.items()},
             bool(self.remarks), self.frame_id)
+
+
+def constant_states(states: Mapping[str, tuple[np.ndarray, np.ndarray]]
+                    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Name -> value (k,) and standard deviation (k,), in SI units, of the states that stay the same
+    over a recording; ``states`` as in a SmootherResult."""
+    # They wander by rounding.
+    return {name: (values[0], sd[0]) for name, (values, sd) in states.items()
+            if len(values) and (np.ptp(values, axis=0) <= 1e-6 * sd.max(axis=0)).all()}
 
 
 def results_value(cdr: bytes) -> dict[str, Any]:

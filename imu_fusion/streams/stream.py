@@ -129,7 +129,7 @@ class Stream:
                 if topic not in self.frame_ids:
                     self.frame_ids[topic] = block.frame_ids[0]
                     self._compare_frames()
-                if not self.concludes:
+                if not self.concludes and not self._frames[topic].keys() >= set(block.frame_ids):
                     self._frames[topic] |= dict.fromkeys(block.frame_ids)
                     self._tell(f.text for f in check_frames(self._frames[topic], topic))
                 values = self.inputs[topic].values(block.values)

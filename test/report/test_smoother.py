@@ -130,7 +130,7 @@ def test_constant_states_are_a_table_and_wandering_ones_a_figure(smoothed):
     wander = np.linspace(0, 1, n)[:, None] * np.ones(3)
     states = dict(smoothed.result.states, gnss_position_error=(wander, np.ones((n, 3))))
     other = replace(smoothed, result=replace(smoothed.result, states=states))
-    section = report._errors(other)
+    (section,) = report._errors(other)
     assert {row[0] for row in table(section).rows} == {"magnetometer bias", "magnetometer scale"}
     (figure,) = [b for b in section.blocks if isinstance(b, Figure)]
     notes = [a.text for a in figure.figure.layout.annotations]
