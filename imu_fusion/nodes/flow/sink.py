@@ -20,7 +20,7 @@ AT_ONCE = 2000  # messages of one topic that are taken in one turn
 NAP, NAP_LIVE = 0.002, 0.0003  # s, in which a block grows: what was sent together comes together
 SILENCE = 5.0  # s, after which what is missing at the end counts as lost
 REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
-REPORT_EVERY = 0.5  # s
+REPORT_EVERY = 1.0  # s
 
 Message = tuple[bytes, dict]
 """CDR bytes; source_timestamp, received_timestamp (ns) and numbers, as rclpy has them."""
