@@ -45,7 +45,7 @@ def step(state, par, stamp, sample, row):
     used = len(state)
     if state[0].field_norm == 0.0 and state[0].queue.count == 0:
         # Without a magnetometer the hypotheses of the field are one.
-        used = par[0].gyroscopes
+        used = par[0].without_field
     else:
         part(state, par)
     if used == 1:
@@ -61,10 +61,10 @@ def step(state, par, stamp, sample, row):
 
 @njit
 def part(state, par):
-    """Let hypotheses go on from the one with the same gyroscope that they were one with so far."""
-    for k in range(par[0].gyroscopes, len(state)):
+    """Let hypotheses go on from the one of another field that they were one with so far."""
+    for k in range(par[0].without_field, len(state)):
         if state[k].stamp != state[0].stamp:
-            state[k] = state[k % par[0].gyroscopes]
+            state[k] = state[k - par[0].without_field]
 
 
 @njit

@@ -51,6 +51,7 @@ PREDICTION = np.dtype([
     ("clipped_rotation", "f8", (3, 3)),  # of R dt over axes at their limit
     ("local_field_keep", "f8"),          # factor that the local field keeps
     ("stays_clipped", "f8", 3),          # 1 where the axis was at its limit before, else 0
+    ("acc_bias_keep", "f8"),             # and that the accelerometer's bias keeps
     ("acc_keep", "f8"),                  # factor that the angular acceleration keeps
     ("rate_gain", "f8"),                 # s, of clipped rate per angular acceleration at the end
     ("rate_mean", "f8"),                 # s, the same on average over the block
@@ -192,6 +193,17 @@ def _put(matrix, rows, corner, which, states):
 
 
 @njit
+def _fade(matrix, keep):
+    """Multiply rows and columns of the accelerometer's bias of (N, N) by ``keep``, in place."""
+    if keep != 1.0:
+        for i in range(ACC_BIAS, MAG_LAG):
+            for j in range(N):
+                matrix[i, j] *= keep
+            for j in range(N):
+                matrix[j, i] *= keep
+
+
+@njit
 def predict(cov, move):
     """cov = Phi cov Phi' + noise, in place. cov (N, N) symmetric; move: a PREDICTION."""
     states = move.states
@@ -201,6 +213,7 @@ def predict(cov, move):
     _moved(move, cov, states, rows)
     _moved(move, np.ascontiguousarray(rows.T), count, corner)
     _put(cov, rows, corner, _MOVED, states)
+    _fade(cov, move.acc_bias_keep)
     for i in range(states):
         cov[i, i] += move.noise[i]
 
@@ -212,6 +225,7 @@ def predict_information(information, move):
     count = len(_MOVED_BACK)
     rows = np.empty((count, N))
     corner = np.empty((count, count))
+    _fade(information, move.acc_bias_keep)
     _moved_back(move, information, states, rows)
     _moved_back(move, np.ascontiguousarray(rows.T), count, corner)
     _put(information, rows, corner, _MOVED_BACK, states)
@@ -224,6 +238,7 @@ def move_error(move, error):
     _moved(move, error.copy().reshape(N, 1), 1, rows)
     out = error.copy()
     out[_MOVED] = rows[:, 0]
+    out[ACC_BIAS:MAG_LAG] *= move.acc_bias_keep
     out[move.states:] = 0.0
     return out
 
@@ -232,8 +247,9 @@ def move_error(move, error):
 def move_adjoint(move, adjoint):
     """Phi' adjoint. adjoint (N,). Returns (N,)."""
     rows = np.empty((len(_MOVED_BACK), 1))
-    _moved_back(move, adjoint.copy().reshape(N, 1), 1, rows)
     out = adjoint.copy()
+    out[ACC_BIAS:MAG_LAG] *= move.acc_bias_keep
+    _moved_back(move, out.copy().reshape(N, 1), 1, rows)
     out[_MOVED_BACK] = rows[:, 0]
     out[move.states:] = 0.0
     return out

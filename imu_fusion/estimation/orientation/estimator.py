@@ -60,15 +60,16 @@ class OrientationEstimator:
         """
         if self._kind(params) != self._kind(self.params):
             raise ParameterError(
-                "parameters 'method', 'gyro_mag.as_printed', 'mode' and the numbers of values of "
-                "'fusion.local_field_sd' and 'fusion.gyro_factor' cannot change while running: "
-                "start another estimator")
+                "parameters 'method', 'gyro_mag.as_printed', 'mode', the numbers of values of "
+                "'fusion.local_field_sd' and 'fusion.gyro_factor', and whether "
+                "'fusion.lasting_acc_sd' is 0 cannot change while running: start another estimator")
         self.params, self._par = params, kernel_parameters(params)
 
     @staticmethod
     def _kind(params):
         return (params.method, params.is_as_printed, params.mode,
-                len(params.fusion.local_field_sd), len(params.fusion.gyro_factor))
+                len(params.fusion.local_field_sd), len(params.fusion.gyro_factor),
+                params.fusion.use_acc and params.fusion.lasting_acc_sd > 0.0)
 
     def reset(self) -> None:
         """Forget all samples: the next ones start a new alignment."""
@@ -252,10 +253,10 @@ class OrientationEstimator:
     def summary(self) -> dict[str, Any]:
         """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla).
 
-        Of the hypotheses it is the likeliest: ``local_field_sd`` and ``gyro_factor``, each with
-        the weight of all that agree. ``wander_tilt`` and ``wander_heading`` are how many times more
-        than white ones its innovations wander: the attitude's standard deviations are widened by
-        what is above 1.
+        Of the hypotheses it is the likeliest: ``local_field_sd``, ``gyro_factor`` and
+        ``lasting_acc_sd``, each with the weight of all that agree. ``wander_tilt`` and
+        ``wander_heading`` are how many times more than white ones its innovations wander: the
+        attitude's standard deviations are widened by what is above 1.
         """
         weight = bank.weights(self._state, self._par)
         best = bank.likeliest(weight)
@@ -274,6 +275,8 @@ class OrientationEstimator:
             gyro_factor=float(self._par[best]["gyro_factor"]),
             local_field_weight=self._weight_of("local_field_sd", weight, best),
             gyro_factor_weight=self._weight_of("gyro_factor", weight, best),
+            lasting_acc_sd=float(self._par[best]["lasting_acc_sd"]),
+            lasting_acc_weight=self._weight_of("lasting_acc_sd", weight, best),
             **{f"wander_{axis}": math.sqrt(value)
                for axis, value in zip(("tilt", "heading"), s["wander"]["overall"])},
             inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,

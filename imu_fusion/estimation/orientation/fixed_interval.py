@@ -50,7 +50,7 @@ def smooth(state: np.ndarray, par: np.ndarray, stamps: np.ndarray, samples: np.n
     tapes = np.zeros(_SEGMENT, es.TAPE)
     bank.part(state, par)
     parted = len(mags) > 0 or state["field_norm"][0] > 0.0
-    used = len(state) if parted else int(par["gyroscopes"][0])
+    used = len(state) if parted else int(par["without_field"][0])
     own = [rows, *(np.zeros_like(rows) for _ in range(1, used))]
     passes = [_forward(state[k:k + 1], par[k:k + 1], logs, own[k], tapes)
               for k in range(len(own))]
@@ -183,7 +183,8 @@ def _correct_row(row, p, error, cov, final, limits, dt):
         gyr[i] += error[es.CLIPPED_RATE + i] * at_limit - error[es.GYRO_BIAS + i]
         for j in range(3):
             gyr[i] += error[es.GYRO_SCALE + 3 * i + j] * rate[j]
-        row.acc[i] -= error[es.ACC_BIAS + i]
+        if p.lasting_acc_sd == 0.0:
+            row.acc[i] -= error[es.ACC_BIAS + i]
         row.gyr_bias_sd[i] = math.sqrt(max(cov[_BIAS + i, _BIAS + i], 0.0))
         if at_limit:
             row.cov_gyr[i, i] = (max(cov[_CLIPPED + i, _CLIPPED + i], 0.0)

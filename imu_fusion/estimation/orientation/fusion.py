@@ -56,6 +56,8 @@ _DISTURBED = 0.5           # weight (10) below which a sample is flagged as dist
 _STILL_LOCAL_RATE = 1e-3   # 1/s: at rest the local field is forgotten in a quarter of an hour
 _BIAS_SD_FLOOR = 2e-4      # rad/s: a first second at rest shows no bias better than that
 _REST_SD = 0.01            # m/s and m: velocity and position at a start at rest
+_LASTING_TIME = 10.0       # s, of accelerations that last in imu axes, such as those of turns
+_REST_LASTING_TIME = 0.3   # s: at rest they are over
 _FIRST_DT = 1e-2           # s: step that stands in for the one before the first sample
 _NO_FIELD = 1e-9           # of its norm: a field without a horizontal part
 _NO_BLOCK = np.zeros(1, es.PREDICTION)
@@ -65,6 +67,9 @@ _NO_SUM = np.zeros(1, MAG_SUM)
 def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None:
     """Start from an Alignment. state (1,): zeroed; par (1,): of kernel_parameters."""
     s, p, a = state[0], par[0], alignment
+    if p["lasting_acc_sd"] > 0.0 and not a.at_rest:
+        # Where tilt and bias begin unknown, too, it explains what it should not.
+        s["log_likelihood"] = -math.inf
     s["gyro_bias"] = a.gyr_bias
     s["gravity"] = a.gravity
     s["heading_var"] = es.UNIFORM_VARIANCE
@@ -304,6 +309,7 @@ def _finish_prediction(s, p):
     noise, time = block.noise, block.time
     keep = math.exp(-time * (_STILL_LOCAL_RATE if s.step.still else 1.0 / f.local_field_time))
     block.local_field_keep = keep
+    block.acc_bias_keep, lasting_var = _lasting(s, p)
     block.acc_keep = math.exp(-time / f.angular_acc_time)
     block.rate_gain = clipped_rate.gain(p, time)
     if time > 0.0:
@@ -317,11 +323,25 @@ def _finish_prediction(s, p):
         noise[es.GYRO_BIAS + i] = p.sensor.gyro_bias_walk ** 2 * time
         noise[es.VELOCITY + i] = f.velocity_walk ** 2 * time
         noise[es.FIELD + i] = f.field_walk ** 2 * time
+        noise[es.ACC_BIAS + i] = lasting_var
+        s.acc_bias[i] *= block.acc_bias_keep
         noise[es.LOCAL_FIELD + i] = p.local_field_sd ** 2 * (1.0 - keep * keep)
         if lasting:
             noise[es.ANGULAR_ACC + i] = acc_var
             noise[es.CLIPPED_RATE + i] = rate_var
         s.local_field[i] *= keep
+
+
+@njit
+def _lasting(s, p):
+    """Factor that the accelerometer's bias keeps over the block, and the variance that it gains:
+    where accelerations last in imu axes it is theirs, too (Gauss-Markov)."""
+    if p.lasting_acc_sd == 0.0:
+        return 1.0, 0.0
+    still = s.step.still
+    keep = math.exp(-s.block.time / (_REST_LASTING_TIME if still else _LASTING_TIME))
+    sd = p.sensor.acc_bias_sd if still else p.lasting_acc_sd
+    return keep, sd ** 2 * (1.0 - keep * keep)
 
 
 @njit
@@ -417,7 +437,9 @@ def _write(s, p, row, taped):
                         + since ** 2 * cov[es.ANGULAR_ACC + i, es.ANGULAR_ACC + i])
         row.gyr[i] = rate[i]
         row.cov_gyr[i, i] = var_gyr
-        row.acc[i] = step.acc[i] - s.acc_bias[i]
+        row.acc[i] = step.acc[i]
+        if p.lasting_acc_sd == 0.0:    # else it is mostly motion
+            row.acc[i] -= s.acc_bias[i]
         row.cov_acc[i, i] = var_acc
         row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))

@@ -11,9 +11,12 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.parameters.record import record
 from imu_fusion.sensors.params import sensor
 
-# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope is
-# given up where the samples are a thousand times likelier without it.
+# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope, and
+# that accelerations come and go, is given up where the samples are a thousand times likelier so.
 _LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.1), math.log(0.001)
+_LOG_ODDS_LASTING = math.log(0.001)
+# Vehicles vibrate: by how much the gyroscope is noisier where accelerations last (a car: 3e-3).
+_VIBRATION = 10.0
 # Rotation from ENU to the world frame that is published, xyzw.
 _WORLD_FRAMES = {
     "enu": (0.0, 0.0, 0.0, 1.0),
@@ -147,6 +150,11 @@ class FusionParams(Parameters):
         doc="By how much sensor.gyro_bias_sd and sensor.gyro_scale_sd are larger than stated. Two "
             "values are two hypotheses, each with each of the local field; gyro_mag takes the "
             "first. Set it to 1 for a gyroscope that was calibrated.")
+    lasting_acc_sd: float = param(
+        1.0, unit="m/s^2", low=0, high=100,
+        doc="Acceleration that lasts in the sensor's axes, as in turns of vehicles and walkers: one "
+            "more hypothesis, after a start at rest, with the gyroscope as stated and near iron. "
+            "Raise it for an aeroplane; 0: none.")
     local_field_time: float = param(
         0.3, unit="s", low=1e-3,
         doc="Time in which a moving sensor leaves that behind. Lengthen it for slow motion.")
@@ -209,7 +217,7 @@ class GyroMagParams(Parameters):
 
 
 _MOTION = ("fusion.velocity_walk", "fusion.velocity_sd", "fusion.velocity_time",
-           "fusion.position_sd", "fusion.position_time")
+           "fusion.position_sd", "fusion.position_time", "fusion.lasting_acc_sd")
 
 
 @dataclass(frozen=True)
@@ -302,35 +310,43 @@ class OrientationParams(Parameters):
 def kernel_parameters(params: OrientationParams) -> np.ndarray:
     """Parameters as the kernels read them: a structured array, an element for each hypothesis.
 
-    The gyroscope's hypotheses come first, all with the first one of the field. Beside the
-    parameters under their names it has, at the top level, what follows from them: log_prior,
-    local_field_sd and gyro_factor of the hypothesis, how many gyroscopes there are, gyro_delay,
+    Those that differ without a magnetometer come first: of the gyroscope, all with the first one of
+    the field, and of lasting acceleration. Beside the parameters under their names it has, at the
+    top level, what follows from them: log_prior, local_field_sd, gyro_factor and lasting_acc_sd of
+    the hypothesis, how many differ without_field, gyro_delay,
     gyro_delay_sd, mag_delay_sd (s; zero where a delay is taken as known), declination, heading_sd
     (rad), frame_from_enu (4,), use_acc and rest_force (m/s^2; with gyro_mag neither the filter nor
     its rest detector looks at the accelerometer), follows_field, as_printed.
     """
-    fields, factors = params.fusion.local_field_sd, params.fusion.gyro_factor
+    f = params.fusion
+    fields, factors = f.local_field_sd, f.gyro_factor
     if params.method != "fusion":
-        fields, factors = fields[:1], factors[:1]
-    return np.concatenate([_hypothesis(params, field, factor) for field in fields
-                           for factor in factors])
+        return _hypothesis(params, fields[0], factors[0], 0.0, 1)
+    first = [(fields[0], factor, 0.0) for factor in factors]
+    if f.use_acc and f.lasting_acc_sd > 0.0:
+        first.append((fields[-1], factors[0], f.lasting_acc_sd))
+    rest = [(field, factor, 0.0) for field in fields[1:] for factor in factors]
+    return np.concatenate([_hypothesis(params, *each, len(first)) for each in first + rest])
 
 
-def _hypothesis(params: OrientationParams, local_field_sd: float,
-                gyro_factor: float) -> np.ndarray:
+def _hypothesis(params: OrientationParams, local_field_sd: float, gyro_factor: float,
+                lasting_acc_sd: float, without_field: int) -> np.ndarray:
     s, f = params.sensor, params.fusion
-    gyroscopes = len(f.gyro_factor) if params.method == "fusion" else 1
-    log_prior = (_LOG_ODDS_IRON * (local_field_sd != f.local_field_sd[0])
+    log_prior = (_LOG_ODDS_LASTING if lasting_acc_sd > 0.0 else
+                 _LOG_ODDS_IRON * (local_field_sd != f.local_field_sd[0])
                  + _LOG_ODDS_POOR * (gyro_factor != f.gyro_factor[0]))
+    noise = _VIBRATION if lasting_acc_sd > 0.0 else 1.0
     params = replace(params, sensor=replace(
-        s, gyro_bias_sd=gyro_factor * s.gyro_bias_sd, gyro_scale_sd=gyro_factor * s.gyro_scale_sd))
+        s, gyro_noise_density=noise * s.gyro_noise_density,
+        gyro_bias_sd=gyro_factor * s.gyro_bias_sd, gyro_scale_sd=gyro_factor * s.gyro_scale_sd))
     with_acc = params.method == "fusion"
     return record(
         params,
         log_prior=log_prior,
-        gyroscopes=gyroscopes,
+        without_field=without_field,
         local_field_sd=local_field_sd,
         gyro_factor=gyro_factor,
+        lasting_acc_sd=lasting_acc_sd,
         gyro_delay=s.gyro_delay or 0.0,
         gyro_delay_sd=s.gyro_delay_sd if s.gyro_delay is None else 0.0,
         mag_delay_sd=s.mag_delay_sd if s.mag_delay is None else 0.0,

@@ -11,7 +11,7 @@ from imu_fusion.estimation.orientation import bank
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.samples.logs import MagLog
-from imu_fusion.simulation.rotation import Tumbling, earth_field, simulate
+from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 from test.estimation.orientation.test_estimator import NOISY, feed, make
 from test.estimation.orientation.test_fusion import local_errors, rmse_deg, tilt_errors_deg
 
@@ -33,6 +33,63 @@ def recording(local_sd, seed=4, duration=30.0):
 @pytest.fixture(scope="module")
 def beside_iron():
     return recording(0.15)
+
+
+class _Laps:
+    """At rest for 3 s, then circles of 2 m at 2 m/s, level and with a little swaying."""
+
+    radius, rate, sway = 2.0, 1.0, 0.05
+
+    def _angle(self, t):
+        moving = np.maximum(t - 3.0, 0.0)
+        return self.rate * (moving + np.expm1(-moving))    # fades in within a second or two
+
+    def _attitude(self, t):
+        swaying = self.sway * np.sin(6.0 * t) * (t > 3.0) * (1.0 - np.exp(3.0 - t)) ** 3
+        return (Rotation.from_rotvec(self._angle(t)[:, None] * [0.0, 0.0, 1.0])
+                * Rotation.from_rotvec(swaying[:, None] * [0.8, 0.6, 0.0]))
+
+    def truth(self, t):
+        t, h = np.asarray(t), 1e-3
+        angle = self._angle(t)
+        moving = np.maximum(t - 3.0, 0.0)
+        first, second = self.rate * -np.expm1(-moving), self.rate * np.exp(-moving) * (t > 3.0)
+        out = np.column_stack([np.sin(angle), -np.cos(angle), 0.0 * t])
+        along = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * t])
+        turn = (self._attitude(t - h).inv() * self._attitude(t + h)).as_rotvec() / (2.0 * h)
+        return (self._attitude(t).as_quat(), turn, self.radius * out,
+                self.radius * (second[:, None] * along - first[:, None] ** 2 * out))
+
+
+@pytest.fixture(scope="module")
+def laps():
+    sensors = Sensors(gyr_density=3e-4, acc_density=5e-3, gyr_bias=(0.01, -0.01, 0.005),
+                      gyr_matrix=np.eye(3) + 0.004 * np.array([[1, 1, 1], [0, 1, -1], [1, 0, 1]]))
+    imu, _, truth, _ = simulate(_Laps(), 60.0, rate=50.0, sensors=sensors, seed=1)
+    return imu, truth
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+def test_laps_turn_neither_the_vertical_nor_the_heading(laps, mode):
+    """2 m/s^2 towards the middle, for a minute: in the sensor's axes the force stands still."""
+    imu, truth = laps
+    estimator = make({"mode": mode})
+    rows = estimator.run(imu)
+    assert estimator.summary()["lasting_acc_weight"] > 0.99
+    assert estimator.summary()["lasting_acc_sd"] == 1.0
+    turn = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    error = np.einsum("nij,nj->ni", turn, local_errors(rows, truth))
+    cov = (turn @ rows["cov_attitude"] @ turn.transpose(0, 2, 1))[:, :2, :2]
+    distance = np.einsum("ni,nij,nj->n", error[:, :2], np.linalg.inv(cov), error[:, :2])
+    assert (distance < 11.83).mean() > 0.95
+    one = make({"mode": mode, "fusion.lasting_acc_sd": 0.0}).run(imu)
+    tilt, before = (np.sqrt((tilt_errors_deg(r, truth) ** 2).mean()) for r in (rows, one))
+    assert tilt < 1.5 and tilt < 0.5 * before
+    drift = np.unwrap(error[:, 2])
+    assert abs(np.degrees(drift[-1] - drift[0])) < 60.0 * np.degrees(0.004 + 0.003)
+    # What lasts is motion: it is published.
+    late = imu.stamp > imu.stamp[0] + int(20e9)
+    assert rows["acc"][late] == pytest.approx(imu.acc[late], abs=0.06)
 
 
 def test_the_samples_choose_the_hypothesis():

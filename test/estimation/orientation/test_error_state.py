@@ -47,6 +47,7 @@ def test_prediction_is_the_flow_of_the_error():
     time, steps, acc_time = 0.02, 4000, 0.04
     move = np.zeros(1, es.PREDICTION)[0]
     move["time"], move["states"], move["local_field_keep"] = time, es.N, 1.0
+    move["acc_bias_keep"] = 1.0
     move["rotation"] = move["clipped_rotation"] = rotation * time
     move["rotation_gyr"] = (rotation[:, :, None] * gyr * time).reshape(3, 9)
     move["force"] = force * time

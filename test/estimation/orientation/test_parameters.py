@@ -75,6 +75,7 @@ def test_gyro_delay_sd_is_part_of_the_covariance_while_turning(moving):
     """With half a step, evenly distributed, between rates at their stamps and means of a step."""
     # Of one hypothesis: a mixture's is added in the axes of each.
     rows = [run(moving, {"sensor.gyro_delay_sd": sd, "fusion.local_field_sd": 0.01,
+                         "fusion.lasting_acc_sd": 0.0,
                          "fusion.gyro_factor": 1.0})
             for sd in (0.0, 0.01)]
     added = rows[1]["cov_attitude"] - rows[0]["cov_attitude"]
