@@ -20,7 +20,7 @@ AT_ONCE = 2000  # messages of one topic that are taken in one turn
 NAP, NAP_LIVE = 0.002, 0.0003  # s, in which a block grows: what was sent together comes together
 SILENCE = 5.0  # s, after which what is missing at the end counts as lost
 REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
-REPORT_EVERY = 1.0  # s
+REPORT_EVERY = 0.5  # s
 
 Message = tuple[bytes, dict]
 """CDR bytes; source_timestamp, received_timestamp (ns) and numbers, as rclpy has them."""
@@ -164,6 +164,7 @@ class Sink:
         self.woken = False
         self._hold, self._on_begin = hold, on_begin
         self._begun = False
+        self._left: dict[str, int] = {}  # broken session -> its version then
         self._reported: dict[str, int] = {}  # topic -> count
         self._unreported = 0.0  # bytes
         self._report_at = 0.0
@@ -288,12 +289,13 @@ class Sink:
     def _follow(self, peer):
         said = peer.state.sending
         session = self.sessions.get(peer.instance)
-        if session is not None and session.id == said.session:
+        if session is not None and session.id == said.session and not session.broken:
             session.said = said
         elif session is not None and not session.finished:
             if not session.has_ended:
                 self._break(session, "went on without this node")
-        elif said.event == BEGIN and self.peers.own in said.company and not self._hold():
+        elif (said.event == BEGIN and self.peers.own in said.company and not self._hold()
+              and said.version > self._left.get(said.session, 0)):
             self._join(peer, said)
 
     def _join(self, peer: Peer, said: Sending) -> None:
@@ -335,6 +337,7 @@ class Sink:
 
     def _break(self, session, why):
         session.broken = True
+        self._left[session.id] = session.said.version
         if session.topics:
             self.peers.problem(f"the session of {session.source} broke off: it {why}")
 
