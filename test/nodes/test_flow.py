@@ -306,6 +306,21 @@ def test_second_publisher_is_named_counted_and_stops_nothing(graph, capfd):
     assert "driver publishes /numbers beside /sender" in capfd.readouterr().err
 
 
+def test_transforms_of_others_are_counted_and_no_fault(graph, capfd):
+    driver = graph.node("driver")
+    other = driver.create_publisher(Int64, "/tf", 10)
+    receiver = Receiver(graph, topic="/tf")
+    sender = Sender(graph, topic="/tf", wait_for=["receiver"])
+    sender.session(100, event=None)
+    graph.until(lambda: len(receiver.values) == 100 and other.get_subscription_count() == 1)
+    other.publish(Int64(data=-1))
+    graph.until(lambda: -1 in receiver.values)
+    sender.event = END
+    graph.until(lambda: receiver.ended and sender.source.drained())
+    assert receiver.input.unexpected == 1
+    assert not receiver.flow.problems and "driver" not in capfd.readouterr().err
+
+
 def test_without_a_session_messages_flow_unacknowledged(graph):
     receiver, sender = Receiver(graph), Sender(graph)
     graph.until(lambda: sender.out.matched() == 1)

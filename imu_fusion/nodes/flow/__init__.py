@@ -41,8 +41,8 @@ must acknowledge what is in the queue of the reader, and answer ``wait_for_all_a
 
 from imu_fusion.nodes.flow.flow import Flow
 from imu_fusion.nodes.flow.qos import DEPTH, reliable_qos, sensor_qos, steady_timer
-from imu_fusion.nodes.flow.sink import Turn
+from imu_fusion.nodes.flow.sink import NAP_LIVE, NAP_PATIENT, Turn
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT
 
-__all__ = ["BEGIN", "DEPTH", "END", "NEXT", "Flow", "Turn", "reliable_qos", "sensor_qos",
+__all__ = ["BEGIN", "DEPTH", "END", "NAP_LIVE", "NAP_PATIENT", "NEXT", "Flow", "Turn", "reliable_qos", "sensor_qos",
            "steady_timer"]

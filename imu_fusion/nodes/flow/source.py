@@ -245,14 +245,15 @@ class Source:
             return
         for instance, joined in self._answers().items():
             name, before = self._takers.get(instance, ("", None))
-            if joined is None and before is not None:  # it has lost sight of us for a while
-                joined = replace(before, finished=True)
-            if joined is not None:
-                self._takers[instance] = name or self.peers[instance].name, joined
-                if (before is not None and joined.finished and not before.finished
-                        and self.phase in (_JOINING, _OPEN)):
-                    self._miss(instance, "has left")
-                    self.company.discard(instance)  # asked anew, if it is still there
+            if joined is None and before is not None and instance in self.peers:
+                joined = replace(before, finished=True)  # it has lost sight of us for a while
+            if joined is None:
+                continue
+            self._takers[instance] = name or self.peers[instance].name, joined
+            if (before is not None and joined.finished and not before.finished
+                    and self.phase in (_JOINING, _OPEN)):
+                self._miss(instance, "has left")
+                self.company.discard(instance)  # asked anew, if it is still there
         if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
             self.peers.say()
