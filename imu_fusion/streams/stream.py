@@ -78,11 +78,10 @@ class Stream:
         calibration: of the Imu: what comes in is calibrated before anything else.
 
     Subclasses name in ``same_frame`` the topics whose axes must be parallel, in ``one_clock`` those
-    whose sensors share a clock (None: all do, see BlockMerger), in ``answered`` those whose samples
-    are answered at once when live, where the others' are not (None: no such difference), and implement
-    ``restart`` (forget everything), ``use`` (samples of one epoch in, Messages out), ``flush``
-    (Messages of what is held back), and where they have something to say ``look_at`` (texts about
-    first samples), ``remarks`` and ``conclude``.
+    whose sensors share a clock (None: all do, see BlockMerger), in ``answered`` those with whose
+    samples estimates come (None: with all), and implement ``restart`` (forget everything), ``use``
+    (samples of one epoch in, Messages out), ``flush`` (Messages of what is held back), and where
+    they have something to say ``look_at`` (texts about first samples), ``remarks`` and ``conclude``.
     """
 
     same_frame: ClassVar[tuple[str, ...]] = ()

@@ -14,7 +14,8 @@ processes the session of somebody else). What makes it lossless:
    start of a node: the same name later, or twice, is somebody else.
 3. **Joining**: a session lists the instances that it knows, and sends nothing before each has
    answered with the readers that it has made, and these are matched. Who comes later is added to
-   the list: sending stops, the counts are stated, the newcomer answers. A node between takes
+   the list: sending stops, the counts are stated, the newcomer answers; so does one that had lost
+   sight of the sender (a lease may run out on one side only). A node between takes
    nothing before its own session may send, and lists also those whom its sender knows (discovery
    between each two nodes takes its own time); so readiness passes along the chain. Who waits for
    no names begins when nobody new has been seen for a second.
@@ -34,9 +35,10 @@ tell twice a second how much they have taken, and that opens the writer as well 
 
 Limits. Each hop buffers up to 1000 messages a topic (fastdds.xml; 5000 with other profiles). Nobody
 can tell the messages of two publishers of one topic: a second one is named and its messages are
-counted as not expected, but reach the estimators. A killed node is noticed when its lease of five
-seconds is over (fastdds.xml; twenty with other profiles). Tried with Fast DDS; other middleware
-must acknowledge what is in the queue of the reader, and answer ``wait_for_all_acked`` at once.
+counted as not expected (no fault on /tf, which many share), but reach the estimators. A killed
+node is noticed when its lease of five seconds is over (fastdds.xml; twenty with other profiles).
+Tried with Fast DDS; other middleware must acknowledge what is in the queue of the reader, and
+answer ``wait_for_all_acked`` at once.
 """
 
 from imu_fusion.nodes.flow.flow import Flow
@@ -44,5 +46,5 @@ from imu_fusion.nodes.flow.qos import DEPTH, reliable_qos, sensor_qos, steady_ti
 from imu_fusion.nodes.flow.sink import NAP_LIVE, NAP_PATIENT, Turn
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT
 
-__all__ = ["BEGIN", "DEPTH", "END", "NAP_LIVE", "NAP_PATIENT", "NEXT", "Flow", "Turn", "reliable_qos", "sensor_qos",
-           "steady_timer"]
+__all__ = ["BEGIN", "DEPTH", "END", "NAP_LIVE", "NAP_PATIENT", "NEXT", "Flow", "Turn",
+           "reliable_qos", "sensor_qos", "steady_timer"]
