@@ -81,7 +81,7 @@ class Stream:
     whose sensors share a clock (None: all do, see BlockMerger), in ``answered`` those with whose
     samples estimates come (None: with all), and implement ``restart`` (forget everything), ``use``
     (samples of one epoch in, Messages out), ``flush`` (Messages of what is held back), and where
-    they have something to say ``look_at`` (texts about first samples), ``remarks`` and ``conclude``.
+    they have something to say ``look_at`` (texts on first samples), ``remarks`` and ``conclude``.
     """
 
     same_frame: ClassVar[tuple[str, ...]] = ()
