@@ -146,8 +146,8 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
 
 def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> dict[str, int]:
     """{file: rows} of the files of one topic."""
-    table = _BIAS if topic.endswith(_BIAS_TOPIC) else _TABLES[reader.topics[topic].msgtype]
-    layout, names, values = table
+    chosen = _BIAS if topic.endswith(_BIAS_TOPIC) else _TABLES[reader.topics[topic].msgtype]
+    layout, names, values = chosen
     stem = topic.strip("/").replace("/", "_")
     suffixes: dict[str, Any] = {".csv": _Csv(names)}
     if layout in (POSE, ODOMETRY):
