@@ -182,6 +182,57 @@ def test_vanished_consumer_is_named_and_does_not_block_the_others(graph):
     assert sender.flow.problems == ["/gone has vanished in mid-session"]
 
 
+def test_names_are_waited_for_until_the_first_message_and_not_again(graph):
+    """One of them has died when somebody else comes: nobody waits for it to come back."""
+    gone, stays = Receiver(graph, "gone"), Receiver(graph, "stays")
+    sender = Sender(graph, wait_for=["gone", "stays"])
+    sender.session(50, event=None)
+    graph.until(lambda: len(gone.values) == len(stays.values) == 50)
+    graph.remove(gone.node)
+    graph.until(lambda: sender.flow.problems)
+    late = Receiver(graph, "late")
+    graph.until(lambda: late.flow.sink.feeding() and sender.source.ready())
+    sender.todo, sender.event = [50], END
+    graph.until(lambda: stays.ended and late.ended and sender.source.drained())
+    assert stays.values == list(range(51)) and late.values == [50]
+    assert sender.flow.problems == ["/gone has vanished in mid-session"]
+
+
+def test_who_has_lost_sight_of_a_sender_at_its_end_is_not_waited_for(graph):
+    """As of one that was stopped for longer than its lease when it had sent everything: for its
+    receivers the session is broken, and one that has ended is not joined again."""
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    receiver.takes = False
+    sender.session(10)
+    graph.until(lambda: sender.source.sending().event == END)
+    writers, hear = receiver.flow.peers._writers, sender.flow.peers._hear
+    receiver.flow.peers._writers = lambda topic: set()
+    sender.flow.peers._hear = lambda *_: None
+    receiver.takes = True
+    graph.until(lambda: not receiver.flow.sink.sessions)
+    receiver.flow.peers._writers, sender.flow.peers._hear = writers, hear
+    receiver.flow.peers._said = None
+    receiver.flow.peers.say()    # a lease brings back what was said last
+    graph.until(sender.source.drained)
+    assert sender.flow.problems == ["/receiver lost sight of this node in mid-session"]
+
+
+def test_node_between_whose_sender_dies_waits_for_nobody_that_only_that_one_knew(graph):
+    """It would be deaf to all senders after it."""
+    mute, doubler = Receiver(graph, "mute", hold=lambda: True), Doubler(graph)
+    sender = Sender(graph, wait_for=["doubler"])
+    sender.session(10)
+    graph.until(lambda: "/mute" in doubler.flow.source.waiting_for() and doubler.begun == [])
+    graph.until(lambda: mute.flow.peers.own in doubler.flow.sink.company())
+    graph.remove(sender.node)
+    graph.remove(mute.node)
+    receiver, again = Receiver(graph, topic="/doubled"), Sender(graph, "again",
+                                                                wait_for=["doubler"])
+    again.session(10)
+    graph.until(again.source.drained)
+    graph.until(lambda: receiver.values[-21:] == twice(10))
+
+
 def test_restarted_under_its_name_it_is_somebody_else(graph):
     stays = Receiver(graph, "stays")
     first = Receiver(graph, "receiver")

@@ -122,6 +122,7 @@ class Source:
         self.foreign: dict[str, list[str]] = {}
         self.company: set[str] = set()  # instances that must have joined
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
+        self._awaited = set(self._wait_for)  # until the first session is open
         self._seen: set[str] = set()  # instances, and gids of readers that may be of others
         # When anybody new was seen last.
         self._news_at = float("-inf") if wait_for else time.monotonic()
@@ -200,7 +201,7 @@ class Source:
         if self.phase == _JOINING:
             names = {peer.name for peer in self.peers.values() if peer.is_silent}
             names |= {instance.partition(MARK)[0] for instance in self._waiting()}
-            names |= self._wait_for - self._names()
+            names |= self._awaited - self._names()
             return ("no answer yet from " + ", ".join(sorted(names)) if names
                     else "discovery is not complete")
         if self.phase == _LIVE:
@@ -226,12 +227,14 @@ class Source:
                 self.phase = _JOINING
                 self.peers.say()
         else:
-            known = self.company & self.peers.keys()
+            # Who speaks of this session no more had lost sight of us, and joins none that has ended.
+            known = {i for i, joined in self._answers().items() if joined is not None}
         for instance in self.company - known:
             self.company.discard(instance)
             _, joined = self._takers.get(instance, ("", None))
             if joined is not None and not joined.finished:
-                self._miss(instance, "has vanished")
+                self._miss(instance, "lost sight of this node" if instance in self.peers
+                           else "has vanished")
             if self.phase != _ENDED:
                 self.peers.say()
         self.advance()
@@ -249,6 +252,7 @@ class Source:
                     self._miss(instance, "has left")
         if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
+            self._awaited.clear()
             self.peers.say()
         if self.phase == _OPEN:
             for output in self.outputs.values():
@@ -298,7 +302,7 @@ class Source:
 
     def _all_joined(self):
         """All have answered, and the readers that they speak of are matched."""
-        if (self._waiting() or self._wait_for - self._names()
+        if (self._waiting() or self._awaited - self._names()
                 or any(peer.is_silent for peer in self.peers.values()) or self._is_settling()):
             return False
         for topic, output in self.outputs.items():
