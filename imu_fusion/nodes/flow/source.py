@@ -227,7 +227,7 @@ class Source:
                 self.phase = _JOINING
                 self.peers.say()
         else:
-            # Who speaks of this session no more had lost sight of us, and joins none that has ended.
+            # Who speaks of it no more had lost sight of us, and joins no session that has ended.
             known = {i for i, joined in self._answers().items() if joined is not None}
         for instance in self.company - known:
             self.company.discard(instance)
