@@ -19,7 +19,7 @@ from imu_fusion.sources.source import Source
 from imu_fusion.sources.table import TableSource
 from imu_fusion.sources.tables import Tables
 from imu_fusion.sources.ulog import MAGIC, Ulog
-from imu_fusion.sources.ximu3 import Ximu3
+from imu_fusion.sources.ximu3 import Ximu3, Ximu3Csv, is_csv
 
 HEAD = 1 << 16    # bytes of each part by which a format is recognised
 Heads = Mapping[str, bytes]
@@ -60,6 +60,9 @@ def _is_phyphox(heads: Heads) -> bool:
            .endswith(".xlsx")) for part, head in heads.items()):
         return len(heads) == 1
     names = _csvs(heads)
+    if any(PurePosixPath(part).parts[-2:] == ("meta", "time.csv")
+           and re.match(rb'(\xef\xbb\xbf)?"?event"?[,;\t]', head) for part, head in heads.items()):
+        return True
     known = any(re.match(r"(accelerometer|gyroscope|raw data)$", name) for name in names)
     return known and any(re.match(rb'(\xef\xbb\xbf)?"?Time \(s\)"?[,;\t]', head)
                          for head in names.values())
@@ -79,6 +82,10 @@ def _is_ximu3(heads: Heads) -> bool:
     source = Ximu3()
     found = sum(len(block.log) for block in source.feed(head[:8192]))
     return part.lower().endswith(".ximu3") or found > 2 * sum(source.lost.values()) + 2
+
+
+def _is_ximu3_csv(heads: Heads) -> bool:
+    return any(is_csv(stem, head) for stem, head in _csvs(heads).items())
 
 
 def _starts(*beginnings: bytes) -> Callable[[Heads], bool]:
@@ -118,6 +125,7 @@ FORMATS = {known.name: known for known in (
     Format("ubx", "u-blox UBX and NMEA of a GNSS receiver", _is_receiver, Receiver, Receiver),
     Format("nmea", "NMEA of a GNSS receiver", lambda heads: False, Receiver, Receiver),
     Format("ximu3", "x-io x-IMU3", _is_ximu3, Ximu3, Ximu3),
+    Format("ximu3_csv", "x-io x-IMU3, a session saved as CSV", _is_ximu3_csv, Ximu3Csv),
     Format("table", "table whose header names sensors, axes and units", _describe_themselves,
            Tables))}
 """By name, in the order in which they are tried."""
