@@ -25,7 +25,7 @@ from benchmarks.fuzz import KINDS, mutated, outcome, write_db3, write_mcap, writ
 from imu_fusion.calibrate.files import read_topic
 from imu_fusion.cli import cli
 from imu_fusion.errors import INCOMPLETE, BagError
-from imu_fusion.messages.convert import fix_message, imu_message
+from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, MAG
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.nodes.pipeline import find_left_out, plan_pipeline
@@ -331,6 +331,20 @@ def test_a_broken_message_among_many_stops_no_door_and_is_counted_alike(tmp_path
     log, fix, remarks = read_topic(bag, "imu/data_raw", lost.append)    # of every calibration
     assert len(log) == 397 and len(fix) == 1 and len(remarks) == 2
     assert len(lost) == 1 and "1 messages cannot be decoded" in lost[0]
+
+
+def test_two_clocks_in_one_recording_are_told(tmp_path):
+    """A magnetometer whose computer has not been told the time beside an Imu that has."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(200):
+            writer.write("/imu/data_raw", IMU.msgtype, imu_message(
+                START + i * STEP, "imu", [0.0, 0.0, 0.1], [0.0, 0.0, 9.81]), START + i * STEP)
+            writer.write("/imu/mag", MAG.msgtype, mag_message(
+                100 * 10**9 + i * STEP, "imu", [2e-5, 0.0, -4e-5]), START + i * STEP)
+    for door in ("info", "process"):
+        result = through(door, tmp_path / "bag", tmp_path / "out")
+        assert result.exit_code == 0
+        assert "imu/mag: no sample lies within the Imu's time" in result.output
 
 
 @pytest.mark.parametrize("log_time", [0, 1, 2**63, 2**64 - 1])
