@@ -8,6 +8,7 @@ import random
 import shutil
 import sqlite3
 import struct
+import zipfile
 import zlib
 from pathlib import Path
 
@@ -425,7 +426,11 @@ def test_what_is_compressed_otherwise_is_told_how_to_unpack(tmp_path):
     file = write_mcap(tmp_path, "none")
     (tmp_path / "t.mcap.gz").write_bytes(gzip.compress(file.read_bytes()))
     (tmp_path / "t.mcap.zstd").write_bytes(zstandard.compress(b"no recording"))
-    for name, words in (("t.mcap.gz", "gzip -d"), ("t.mcap.zstd", "not an MCAP file")):
+    with zipfile.ZipFile(tmp_path / "whole.zip", "w") as archive:
+        archive.write(file, "t.csv")
+    (tmp_path / "t.zip").write_bytes((tmp_path / "whole.zip").read_bytes()[:-30])
+    for name, words in (("t.mcap.gz", "gzip -d"), ("t.mcap.zstd", "not an MCAP file"),
+                        ("t.zip", "cut off")):
         result = through("info", tmp_path / name, None)
         assert result.exit_code == 1 and words in result.output
         assert f"{tmp_path / name}:" in result.output    # and not the unpacked copy
