@@ -92,6 +92,11 @@ _COLUMNS: tuple[Columns, ...] = (
              *_axes("angular_acceleration", "rad/s^2"),
              *_axes("sd_angular_acceleration", "rad/s^2")], _accel))
 _TABLES = {columns[0].msgtype: columns for columns in _COLUMNS}
+# Biases travel in the angular part of a twist.
+_BIAS_TOPIC = "imu/gyro_bias"
+_BIAS: Columns = (TWIST, [*_axes("gyro_bias", "rad/s"), *_axes("sd_gyro_bias", "rad/s")],
+                  lambda v: np.column_stack([v[:, TWIST["angular"]], _diagonal(
+                      v, TWIST["covariance"], 6, first=3)]))
 
 
 def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
@@ -144,7 +149,8 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
 
 def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> dict[str, int]:
     """{file: rows} of the files of one topic."""
-    layout, names, values = _TABLES[reader.topics[topic].msgtype]
+    chosen = _BIAS if topic.endswith(_BIAS_TOPIC) else _TABLES[reader.topics[topic].msgtype]
+    layout, names, values = chosen
     stem = topic.strip("/").replace("/", "_")
     suffixes: dict[str, Any] = {".csv": _Csv(names)}
     if layout in (POSE, ODOMETRY):

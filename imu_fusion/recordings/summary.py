@@ -58,6 +58,8 @@ def write_summary(folder: Path, names: Iterable[str]) -> Path:
 def _numbers(found: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
     """Numbers in nested results, with their names joined by dots; of texts, how many there are."""
     for key, value in found.items():
+        if key == "units":
+            continue
         name = f"{above}{key}"
         if isinstance(value, Mapping):
             yield from _numbers(value, f"{name}.")
