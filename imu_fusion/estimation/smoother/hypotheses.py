@@ -22,7 +22,8 @@ _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
-_WHITE = 0.3         # of the stated noise that is left white where the rest wanders
+_DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
 def fits(result: SmootherResult) -> bool:
@@ -60,10 +61,14 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
             or any(is_many(outliers) for outliers in found.result.outliers().values())):
         return found.result
     given = model.params.to_mapping()
-    for alternatives in (_delays, _velocity_delays, _wandering_velocities, _wandering_fixes,
+    for alternatives in (_delays, _velocity_delays, _wandering_fixes, _wandering_velocities,
                          _walks):
         for other in alternatives(found, model):
             found, model = _try(found, model, other, smooth)
+    # What wanders can have looked like a delay.
+    for name in (_DELAY, _VELOCITY_DELAY):
+        if model.params.get(name) != given[name]:
+            found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
     return replace(found.result, noise=dict(model.noise), adapted={
         name: value for name, value in model.params.to_mapping().items()
@@ -71,11 +76,11 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
 
 
 def _delays(found, model):
-    return _where_zero(model, {"gnss.time_offset_sd": 0.2})
+    return _where_zero(model, {_DELAY: 0.2})
 
 
 def _velocity_delays(found, model):
-    return _where_zero(model, {"gnss.velocity_time_offset_sd": 0.2})
+    return _where_zero(model, {_VELOCITY_DELAY: 0.2})
 
 
 def _walks(found, model):
@@ -83,24 +88,32 @@ def _walks(found, model):
 
 
 def _wandering_velocities(found, model):
-    return _wandering(found, model, "velocity", "gnss.velocity_error_sd", (1.0,))
+    return _wandering(found, model, "velocity", "gnss.velocity_error")
 
 
 def _wandering_fixes(found, model):
-    return _wandering(found, model, "fix", "gnss.position_error_sd", (1.0, 3.0))
+    return _wandering(found, model, "fix", "gnss.position_error")
 
 
-def _wandering(found, model, name, parameter, factors):
-    """Most of what is stated of readings, or some times as much, as an error that wanders."""
-    readings = found.problem.readings
-    of_kind = readings[readings["kind"] == KINDS[name]]
-    if not len(of_kind):
+def _wandering(found, model, name, error):
+    """What is left of readings as an error that wanders and noise that is white.
+
+    Neighbours differ by the noise. What else is left, the trajectory has followed in part.
+    """
+    left = found.result.residuals.get(name, ())
+    if len(left) < _FEWEST:
         return
-    root = np.linalg.inv(of_kind["whiten"])
-    sd = np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
-    for factor in factors:
-        for other in _where_zero(model, {parameter: tuple((factor * sd).tolist())}):
-            yield other._replace(noise={**model.noise, name: _WHITE})
+    white = float(_MAD * np.median(np.abs(np.diff(left, axis=0))) / np.sqrt(2.0))
+    slow = np.sqrt(max(np.mean(np.square(left)) - white ** 2, white ** 2))
+    readings = found.problem.readings
+    root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
+    sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
+    tau = model.params.get(f"{error}_tau")
+    for factor in (1.0, 3.0):
+        for time in (tau, tau / 4.0):
+            for other in _where_zero(model, {f"{error}_sd": tuple((factor * sd).tolist())}):
+                yield other.changed({f"{error}_tau": time})._replace(
+                    noise={**model.noise, name: white * model.noise.get(name, 1.0)})
 
 
 def _where_zero(model, changes):
