@@ -14,16 +14,19 @@ def tree(source, target, patterns):
 
 # PyPI builds of ROS 2 Jazzy, for machines without an apt ROS. Never mix the two.
 ros = ["ros-jazzy-rclpy>=7.1,<8", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"]
-report = ["plotly>=5.15"]
+report = ["plotly>=5.15", "matplotlib>=3.7"]
+notebook = ["pandas>=2"]
 devices = ["pyubx2>=1.2.40", "pynmeagps>=1.0.40", "pyulog>=1.0", "python-calamine>=0.2.3"]
 terrain = ["rasterio>=1.3", "pyproj>=3.4"]
+# Brings matplotlib and sphinx along.
+calibrate = ["allantools>=2024.6"]
 peers = ["vqf>=2.1", "imufusion>=1.2", "ahrs>=0.4"]
 oracles = ["pyisomme>=1"]
 docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
 test = ["ruff~=0.17.6", "mypy~=2.4.1", "types-PyYAML",
         "pytest>=7.4", "pytest-xdist>=3.5", "pytest-cov>=5",
         "hypothesis>=6", "openpyxl>=3.1", "colcon-common-extensions",
-        *devices, *report, *terrain, *docs]
+        *devices, *report, *notebook, *terrain, *docs]
 
 # Read, not imported: nothing of the package is installed yet.
 nodes = run_path(f"{package_name}/nodes/__init__.py")["NODES"]
@@ -44,7 +47,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         *tree("launch", "launch", ["*.launch.py"]),
-        *tree("config", "config", ["*.yaml", "*.phyphox"]),
+        *tree("config", "config", ["*.yaml", "*.phyphox", "*.json"]),
         *tree("config/surfaces", "config/surfaces", ["*.yaml", "*.asc"]),
         *tree("bags", "bags", ["README.md"]),
         *[entry for folder in sorted(glob("bags/*/"))
@@ -55,14 +58,15 @@ setup(
         "rosbags>=0.10", "mcap>=1.1", "zstandard", "lz4",
         "pymap3d>=3.1", "pygeomag>=1.1", "click>=8.1", "rich>=13",
     ],
-    extras_require={"ros": ros, "report": report, "devices": devices, "terrain": terrain,
+    extras_require={"ros": ros, "report": report, "notebook": notebook, "calibrate": calibrate,
+                    "devices": devices, "terrain": terrain,
                     "peers": peers,
                     "oracles": oracles, "docs": docs, "test": test},
     entry_points={"console_scripts": [
         "imu_fusion = imu_fusion.cli:main",
         *[f"{node} = imu_fusion.nodes:main" for node in nodes],
     ]},
-    package_data={"imu_fusion": ["py.typed"], "imu_fusion.report": ["*.css", "*.js"],
+    package_data={"imu_fusion": ["py.typed"], "imu_fusion.report": ["*.css", "*.js", "*.txt"],
                   "imu_fusion.nodes.flow": ["*.xml"]},
     zip_safe=False,
 )

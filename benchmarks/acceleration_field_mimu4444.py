@@ -13,7 +13,6 @@ from scipy.interpolate import CubicSpline
 from benchmarks.acceleration_field_cases import EXACT
 from benchmarks.data import data_path
 from benchmarks.table import write_table
-from imu_fusion.estimation.acceleration_field.calibration import calibrate_array
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
@@ -22,6 +21,7 @@ from imu_fusion.estimation.acceleration_field.params import (
     Iteration,
     Motion,
 )
+from imu_fusion.sensors.accelerometer_calibration import calibrate_array
 
 RATE = 62.5
 LIMIT = np.radians(1000)

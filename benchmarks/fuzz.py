@@ -1,10 +1,12 @@
 """Broken files by the thousand: ``python -m benchmarks.fuzz [--count N] [--seed S] [KIND ...]``.
 
+KIND may be ``files`` or ``devices``: all kinds of a group.
+
 Each kind of file that the package reads is mutated as disks, cables and people do it (bytes,
 lengths, pages of zeros, parts that are missing, repeated or moved, a cut end), and handed to what
 reads it. The only answer permitted beside a result is one of the package's own errors, within 10 s
-of computing and 1 GB. What fails is kept in ``--keep DIR`` with its mutation; results go to
-benchmarks/results/fuzz.md.
+of computing and 1 GB. What fails is kept in ``--keep DIR`` with its mutation; results of a group
+go to benchmarks/results/fuzz_<group>.md.
 """
 
 import argparse
@@ -19,6 +21,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +30,15 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from benchmarks.fuzz_devices import (
+    DEVICES,
+    read_answer,
+    read_device,
+    read_push,
+    write_answer,
+    write_device,
+    write_push,
+)
 from benchmarks.table import write_table
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
@@ -153,7 +165,8 @@ def read_description(path: Path) -> None:
     convert(path.with_name("table.csv"), path.with_name("out"), path, overwrite=True)
 
 
-KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
+Kind = tuple[Callable[[Path], Path], Callable[[Path], object]]
+FILES: dict[str, Kind] = {
     "mcap_none": (lambda f: write_mcap(f, "none"), read_recording),
     "mcap_lz4": (lambda f: write_mcap(f, "lz4"), read_recording),
     "mcap_zstd": (lambda f: write_mcap(f, "zstd"), read_recording),
@@ -164,20 +177,27 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "parameters": (lambda f: write_text(f, "p.yaml", PARAMETERS), load),
     "surface": (lambda f: write_text(f, "s.yaml", SURFACE), load_surface),
 }
+GROUPS: dict[str, dict[str, Kind]] = {"files": FILES, "devices": {
+    **{kind: (partial(write_device, kind), partial(read_device, kind)) for kind in DEVICES},
+    "phyphox_live": (write_answer, read_answer),
+    "sensor_logger_push": (write_push, read_push),
+}}
+KINDS = {name: kind for group in GROUPS.values() for name, kind in group.items()}
+_TEXT = (".csv", ".yaml", ".txt", ".gpx", ".nmea", ".json")
 
 _WORDS = (b"0", b"-1", b"1e999999", b"nan", b"inf", b"1_0", b"9" * 400, b"'", b'"', b"[", b"{",
           b"}", b"&a ", b"*a", b"!!python/object/apply:os.system [x]", b"\t", b"\0", b"\xff\xfe",
           "\u0663".encode(), b"<<: ", b"---\n", b"%", b"? ", b"null", b"2001-13-45", b",,,,")
 
 
-def mutated(data: bytes, rng: random.Random, text: bool) -> tuple[bytes, list[Mutation]]:
-    """A broken copy, and what was done to it."""
+def mutated(data: bytes, rng: random.Random, suffix: str) -> tuple[bytes, list[Mutation]]:
+    """A broken copy of the content of a file with that suffix, and what was done to it."""
     data, done = bytearray(data), []
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
         size = max(len(data), 1)
         at = rng.randrange(size)
         kind = rng.choice(("byte", "bit", "u32", "u64", "zero", "rand", "splice", "drop", "twice",
-                           "trunc", *(("word",) * 8 if text else ())))
+                           "trunc", *(("word",) * 8 if suffix in _TEXT else ())))
         if kind == "byte":
             data[at:at + 1] = bytes([rng.randrange(256)])
         elif kind == "bit":
@@ -250,7 +270,7 @@ def run(kind: str, count: int, seed: int, keep: Path | None) -> dict:
             sys.exit(f"{kind}: the sound file cannot be read")
         (original.parent / "metadata.yaml").unlink(missing_ok=True)
         for _ in range(count):
-            broken, done = mutated(data, rng, original.suffix in (".csv", ".yaml"))
+            broken, done = mutated(data, rng, original.suffix)
             original.write_bytes(broken)
             began = time.perf_counter()
             result = outcome(read, original)
@@ -269,30 +289,33 @@ def run(kind: str, count: int, seed: int, keep: Path | None) -> dict:
             "peak_mb": round(peak)}
 
 
-def tabulate(results: dict[str, dict], count: int, seed: int) -> None:
-    """Write the table of all kinds."""
-    write_table("fuzz", ("file", "mutations", "read, at least in part", "refused in one line",
+def tabulate(group: str, results: dict[str, dict], count: int, seed: int) -> None:
+    """Write the table of a group."""
+    write_table(f"fuzz_{group}", ("file", "mutations", "read, at least in part", "refused in one line",
                          "tracebacks, hangs", "unforeseen, but caught", "slowest, s", "peak, MB"),
                 [(kind, r["mutations"], r["read"], r["refused"], r["failed"],
                   sum(r["details"].values()) - r["failed"], r["slowest_s"], r["peak_mb"])
                  for kind, r in results.items()],
-                f"python -m benchmarks.fuzz --count {count} --seed {seed}")
+                f"python -m benchmarks.fuzz {group} --count {count} --seed {seed}")
 
 
 def main() -> None:
     """Run the kinds named, all without any; the exit code says whether one failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=", ".join(KINDS))
+    parser.add_argument("kinds", nargs="*", metavar="KIND", default=[*GROUPS],
+                        help=", ".join([*GROUPS, *KINDS]))
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path)
     arguments = parser.parse_args()
     results = {}
-    for kind in arguments.kinds or KINDS:
+    for kind in (kind for name in arguments.kinds for kind in GROUPS.get(name, (name,))):
         results[kind] = run(kind, arguments.count, arguments.seed, arguments.keep)
         print(kind, results[kind], flush=True)
-    if set(results) == set(KINDS):
-        tabulate(results, arguments.count, arguments.seed)
+    for group, kinds in GROUPS.items():
+        if kinds.keys() <= results.keys():
+            tabulate(group, {kind: results[kind] for kind in kinds}, arguments.count,
+                     arguments.seed)
     sys.exit(any(r["failed"] or r["peak_mb"] > MEGABYTES for r in results.values()))
 
 

@@ -8,11 +8,9 @@ Needs a Chromium (``chromium``, ``chromium-browser`` or ``google-chrome``) to dr
 import shutil
 import subprocess
 import tempfile
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-import plotly.offline
 
 from imu_fusion import batch
 from imu_fusion.evaluation.orientation_error import moving_at, orientation_errors, statistics
@@ -21,7 +19,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.contents import moving_changes
 from imu_fusion.report.figures import time_figure
-from imu_fusion.report.html import Figure
+from imu_fusion.report.html import Figure, scripts
 from imu_fusion.report.orientation import angle_panels, error_panels
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -61,12 +59,10 @@ def page():
              f"inclination {inclination.rmse_deg:.2f}°")
     columns = "".join(f"<div><h3>{text}</h3>{Figure(figure, linked=False).render()}</div>"
                       for text, figure in zip(title, (left, right)))
-    script = files("imu_fusion.report").joinpath("report.js").read_text()
     return f"""<!DOCTYPE html><meta charset="utf-8"><style>
 body {{ margin: 0; display: flex; font-family: system-ui, sans-serif; background: #fff; }}
 h3 {{ margin: 14px 0 0 84px; font-size: 15px; font-weight: 600; color: #1f2933; }}
-figure {{ margin: 0; }}</style>{columns}<script>{plotly.offline.get_plotlyjs()}</script>
-<script>const plotConfig = {{displayModeBar: false}};{script}</script>"""
+figure {{ margin: 0; }}</style>{columns}{scripts()}"""
 
 
 def screenshot(html, target, width, height):

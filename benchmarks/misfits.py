@@ -25,7 +25,12 @@ from imu_fusion.estimation.acceleration_field.params import (
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.logs import ImuLog, MagLog
-from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_POSITIONS
+from imu_fusion.simulation.rigid_body_impact import (
+    PAPER_AXES,
+    PAPER_POSITIONS,
+    ImpactScene,
+    RigidMotion,
+)
 from imu_fusion.simulation.rigid_body_impact import simulate as simulate_impact
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from imu_fusion.streams.orientation import IMU_TOPIC, MAG_TOPIC, findings
@@ -97,6 +102,10 @@ FIELD = AccelerationFieldParams(initial=Initial(
     mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=0.05,
     orientation_sd=0.002), gravity=9.8)
 MOTION = simulate_impact(duration=1.0)
+# Falls at 3 m/s onto ground that is up to ten thousand times harder than the paper's.
+HARD = {modulus: simulate_impact(ImpactScene(modulus=modulus, ground=0.6, velocity=(0.75, 0.0, -3.0),
+                                             mass=4.5), duration=0.3, step=5e-6, every=200)
+        for modulus in (1e5, 1e6, 1e7, 1e8)}
 
 
 def layout(**changes) -> dict[str, AccelerometerParams]:
@@ -107,14 +116,15 @@ def layout(**changes) -> dict[str, AccelerometerParams]:
         for name, place, axes in zip(NAMES, PLACES, PAPER_AXES)}
 
 
-def felt(rng, position_sd=0.0, axes_sd=0.0, places=PLACES, jitter=0.0) -> np.ndarray:
-    """Readings (n, 4, 3) of the paper's impact."""
+def felt(rng, position_sd=0.0, axes_sd=0.0, places=PLACES, jitter=0.0,
+         motion: RigidMotion = MOTION) -> np.ndarray:
+    """Readings (n, 4, 3) of an impact."""
     places = places + CENTRE + position_sd * rng.standard_normal(places.shape)
     axes = np.array([a @ Rotation.from_rotvec(axes_sd * rng.standard_normal(3)).as_matrix().T
                      for a in PAPER_AXES])
-    clean = MOTION.readings(places, axes)
+    clean = motion.readings(places, axes)
     if jitter:
-        t = MOTION.t
+        t = motion.t
         for k in range(len(places)):
             at = np.clip(t + rng.normal(0.0, jitter, len(t)), 0.0, t[-1])
             clean[:, k] = np.column_stack([np.interp(at, t, clean[:, k, i]) for i in range(3)])
@@ -122,15 +132,16 @@ def felt(rng, position_sd=0.0, axes_sd=0.0, places=PLACES, jitter=0.0) -> np.nda
             + rng.normal(0.0, NOISE, clean.shape))
 
 
-def field_outcome(readings, accelerometers, params=FIELD) -> Outcome:
-    """Outcome of one recording of the impact."""
+def field_outcome(readings, accelerometers, params=FIELD, motion=MOTION, start=_START) -> Outcome:
+    """Outcome of one recording of an impact, without its first ``start`` samples."""
     estimator = AccelerationFieldEstimator(params, accelerometers)
-    rows = estimator.run(MOTION.stamp, readings)[_START:]
-    force = MOTION.specific_force_body(CENTRE)[_START:]
+    rows = estimator.run(motion.stamp, readings)[start:]
+    force = motion.specific_force_body(CENTRE)[start:]
     errors = {
-        "omega": MOTION.omega[_START:] - rows["omega"], "specific_force": force - rows["specific_force"],
+        "omega": motion.omega[start:] - rows["omega"],
+        "specific_force": force - rows["specific_force"],
         "attitude": (Rotation.from_quat(rows["quat"]).inv()
-                     * Rotation.from_quat(MOTION.quat[_START:])).as_rotvec()}
+                     * Rotation.from_quat(motion.quat[start:])).as_rotvec()}
     nees, shares = [], []
     for name, error in errors.items():
         cov = rows["cov_" + name] + 1e-15 * np.eye(3)
@@ -148,6 +159,19 @@ def field_row(situation, before, readings, changes=None, **params) -> Scenario:
         return field_outcome(readings(np.random.default_rng(seed)), layout(**(changes or {})),
                              FIELD.replace(**params))
     return Scenario("Acceleration field", situation, before, run)
+
+
+def hard_row(modulus, rig, before="", mode="causal", **mounting) -> Scenario:
+    """Scenario of a hard impact."""
+    motion = HARD[modulus]
+    peak = np.linalg.norm(motion.specific_force_body(CENTRE), axis=1)
+
+    def run(seed):
+        return field_outcome(felt(np.random.default_rng(seed), motion=motion, **mounting), layout(),
+                             FIELD.replace(mode=mode), motion, start=20)
+    return Scenario("Acceleration field", f"impact of {peak.max() / 9.81:.0f} g, "
+                    f"{np.sum(peak > 2.0)} ms, {rig}, defaults"
+                    + (", smoothed" if mode == "smoothed" else ""), before, run)
 
 
 def dies(rng):
@@ -197,6 +221,12 @@ FIELD_ROWS = [
     field_row("both", "", lambda rng: felt(rng, position_sd=1e-3, axes_sd=0.035)),
     field_row("both, smoothed", "", lambda rng: felt(rng, position_sd=1e-3, axes_sd=0.035),
               mode="smoothed"),
+    *(hard_row(modulus, "exact rig", f"NEES {before}")
+      for modulus, before in zip(HARD, (10, 990, 27, 67))),
+    *(hard_row(modulus, "1 mm and 2 deg off", f"NEES {before}", position_sd=1e-3, axes_sd=0.035)
+      for modulus, before in zip(HARD, (13, 930, 170, 98))),
+    *(hard_row(modulus, "1 mm and 2 deg off", before, "smoothed", position_sd=1e-3, axes_sd=0.035)
+      for modulus, before in ((1e6, "NEES 1,190"), (1e7, "NEES 1,320"))),
     field_row("one of four dies", "3,406 %, silent", dies),
     field_row("one of four reversed", "peak -29 %, silent", reversed_one),
     field_row("one of four 62 mm from its place", "HIC15 +56 %, silent", misplaced),

@@ -2,15 +2,17 @@
 
     python -m benchmarks.orientation_cross [--quick]
 
-Every choice of GRID runs on every set of ``benchmarks.orientation_sets``. For each family of sets
-(recordings of one origin) the choice is the one that does best on all the other families: least
-mean of log(ours / peer) over causal and smoothed. The table has what that choice does on the family
-left out, beside the package's defaults and the peers.
+Every choice of GRID runs on sets of ``benchmarks.orientation_sets``. For each
+family of sets (recordings of one origin) the choice is the one that does best on all the other
+families: least mean of log(ours / peer) over causal and smoothed. The table has what that choice
+does on the family left out, beside the package's defaults and the peers.
 """
 
 import itertools
 import math
 import sys
+from dataclasses import replace
+from importlib.metadata import version
 
 import numpy as np
 
@@ -18,12 +20,15 @@ from benchmarks.orientation_sets import SETS, peers, score_ours
 from benchmarks.table import write_table
 from imu_fusion.estimation.orientation.params import OrientationParams
 
-GRID = {"fusion.velocity_walk": (0.1, 0.14, 0.2), "fusion.gyro_factor": ((1.0,), (1.0, 5.0))}
-FAMILIES = {"BROAD": [name for name in SETS if name.startswith("BROAD")],
+GRID = {"velocity_walk": (0.14, 0.2), "local_field_sd": ((0.01,), (0.01, 0.1)),
+        "gyro_factor": ((1.0,), (1.0, 5.0))}
+"""Parameters of fusion.*: one hypothesis or both, and how much of the motion is not told."""
+FAMILIES = {"BROAD": ["BROAD", "BROAD, start in motion"],
             "DIODEM": ["DIODEM"], "phones": [name for name in SETS if name.startswith("phones")],
             "OpenAXES": ["OpenAXES, no magnetometer"]}
 _MODES = ("causal", "smoothed")
-_MOST = 3    # recordings of a set, evenly spaced: a choice for every recording takes an hour
+# Recordings of a set, evenly spaced, and s of each: all of them, for every choice, take an hour.
+_MOST, _LONGEST = 2, 100.0
 
 
 def choices():
@@ -31,59 +36,73 @@ def choices():
     return [dict(zip(GRID, values)) for values in itertools.product(*GRID.values())]
 
 
-def _some(name, quick):
-    recordings = list(SETS[name]())
-    return recordings[::-(-len(recordings) // (1 if quick else _MOST))]
+def _shortened(r):
+    """The first part of a recording."""
+    end = int(np.searchsorted(r.imu.stamp, r.imu.stamp[0] + int(_LONGEST * 1e9)))
+    mag = None if r.mag is None else r.mag[r.mag.stamp <= r.imu.stamp[end - 1]]
+    return replace(r, imu=r.imu[:end], mag=mag, reference=r.reference[:end], mask=r.mask[:end])
 
 
-def totals(name, changes, quick):
-    """Mean total errors of a set, deg: {mode: ours}, with parameters changed."""
-    found = [score_ours(r, changes) for r in _some(name, quick)]
-    return {mode: float(np.mean([s[mode].total for s in found])) for mode in _MODES}
-
-
-def _peer_totals(name, quick):
-    found = [peers(r) for r in _some(name, quick)]
-    return {mode: float(np.mean([s[peer].total for s in found]))
-            for mode, peer in zip(_MODES, ("VQF", "OfflineVQF"))}
+def _totals(recordings, run, names):
+    """Mean total error, deg, and share within 3 sigma of recordings by mode; names: of the modes in
+    what ``run`` gives of one."""
+    found = [run(r) for r in recordings]
+    return {mode: tuple(float(np.mean([getattr(s[name], part) for s in found]))
+                        for part in ("total", "within")) for mode, name in zip(_MODES, names)}
 
 
 def _loss(scores, peer, names):
     """Mean log of the error over the peer's, over sets and modes."""
-    return float(np.mean([math.log(scores[name][mode] / peer[name][mode])
+    return float(np.mean([math.log(scores[name][mode][0] / peer[name][mode][0])
                           for name in names for mode in _MODES]))
+
+
+def _cell(scores):
+    error, within = zip(*(scores[mode] for mode in _MODES))
+    shares = "" if math.isnan(within[0]) else f" ({within[0]:.2f} / {within[1]:.2f})"
+    return f"{error[0]:.2f} / {error[1]:.2f}" + shares
+
+
+def _told(changes):
+    return ", ".join(f"{key} {' '.join(map(str, np.atleast_1d(value)))}"
+                     for key, value in changes.items())
 
 
 def main(arguments):
     quick = "--quick" in arguments
-    peer = {name: _peer_totals(name, quick) for names in FAMILIES.values() for name in names}
+    sets = {}
+    for name in (name for names in FAMILIES.values() for name in names):
+        recordings = list(SETS[name]())
+        step = -(-len(recordings) // (1 if quick else _MOST))
+        sets[name] = [_shortened(r) for r in recordings[::step]]
+    peer = {name: _totals(some, peers, ("VQF", "OfflineVQF")) for name, some in sets.items()}
     tried = []
     for changes in choices():
-        tried.append((changes, {name: totals(name, changes, quick) for name in peer}))
-        print(changes, {n: {m: round(v, 2) for m, v in s.items()} for n, s in tried[-1][1].items()},
-              flush=True)
+        told = {f"fusion.{key}": value for key, value in changes.items()}
+        tried.append((changes, {
+            name: _totals(some, lambda r, told=told: score_ours(r, told), _MODES)
+            for name, some in sets.items()}))
+        print(_told(changes), f"{_loss(tried[-1][1], peer, list(sets)):.3f}", flush=True)
     usual = OrientationParams().fusion
     default = next(scores for changes, scores in tried if all(
-        getattr(usual, key.split(".")[1]) == value for key, value in changes.items()))
+        getattr(usual, key) == value for key, value in changes.items()))
     rows = []
     for names in FAMILIES.values():
-        others = [name for name in peer if name not in names]
+        others = [name for name in sets if name not in names]
         changes, scores = min(tried, key=lambda one: _loss(one[1], peer, others))
-        for name in names:
-            cells = [f"{group[name]['causal']:.2f} / {group[name]['smoothed']:.2f}"
-                     for group in (peer, scores, default)]
-            rows.append([name, ", ".join(f"{key.split('.')[1]} {value}"
-                                         for key, value in changes.items()), *cells])
+        rows += [[name, str(len(sets[name])), _told(changes),
+                  *(_cell(group[name]) for group in (peer, scores, default))] for name in names]
     if quick:
         for row in rows:
             print(" | ".join(row))
         return
-    write_table("orientation_cross", ["set", "chosen on the other families",
-                                      "VQF / OfflineVQF, deg", "ours, so chosen",
+    write_table("orientation_cross", ["set", "trials", "chosen on the other families",
+                                      "VQF / OfflineVQF, deg", "ours, so chosen (within 3 sigma)",
                                       "ours, defaults"], rows,
-                note=f"Causal / smoothed, mean total error of up to {_MOST} recordings of each "
-                "set. " + "; ".join(
-                    f"{key}: {', '.join(map(str, values))}" for key, values in GRID.items()) + ".")
+                note=f"Causal / smoothed, mean total error, of {_LONGEST:.0f} s of up to {_MOST} recordings "
+                f"of each set; vqf {version('vqf')}. Chosen from " + "; ".join(
+                    f"{key}: {' or '.join(' '.join(map(str, np.atleast_1d(v))) for v in values)}"
+                    for key, values in GRID.items()) + ".")
 
 
 if __name__ == "__main__":

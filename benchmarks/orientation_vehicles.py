@@ -67,8 +67,8 @@ def main():
         "recording", "sd of the reference, deg", "estimator", "tilt RMS, deg", "largest",
         "stated RMS", "within 3 sigma"], rows,
         note="A vehicle keeps its accelerations longer than a hand. By default the errors are "
-             "smaller than the peers', but the covariance knows little of them; told what a "
-             "vehicle is like, it does. The preset's magnetometer errors were chosen on this "
+             "smaller than the peers', and the covariance is widened by what the innovations "
+             "show; told what a vehicle is like, it is closer. The preset's magnetometer errors were chosen on this "
              "aeroplane.")
 
 

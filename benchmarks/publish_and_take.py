@@ -29,7 +29,7 @@ def publish(outs, count):
     for i in range(count):
         for publisher in outs:
             publisher.publish(MADE[publisher.msg_type])
-        if i % (WINDOW // 2) == WINDOW // 2 - 1:
+        if i % WINDOW == WINDOW - 1:
             while not all(p.wait_for_all_acked(Duration(nanoseconds=0)) for p in outs):
                 time.sleep(NAP)
 

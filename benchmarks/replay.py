@@ -22,16 +22,19 @@ from mcap.reader import make_reader
 from benchmarks.acceleration_field_live import cpu_seconds
 from benchmarks.recording_of_all import write_parameters, write_recording
 from benchmarks.table import RESULTS
+from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.messages.layouts import IMU
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.streams.orientation import OrientationStream, warm_up
 
 HERE = Path(__file__).resolve().parents[1]
 BAG = HERE / "bags" / "broad_06_fast_rotation"
 RATE = 286  # Hz, of each topic
+BLOCK = 1000  # messages that an estimator takes at once at rate 0, about
 LONG, SHORT, LIVE = 240, 40, 30  # s of recorded time
 STARTED = 5 * 10**9  # ns, after which delays count: an orientation begins with a second at once
 TOPICS = ("imu/data_raw", "imu/mag", "imu/data")
@@ -139,6 +142,32 @@ def bound_once(count):
         env=os.environ | domain | {"PYTHONPATH": str(HERE)}) for role in reversed(BOUND)})
 
 
+def work_alone(bag, folder):
+    """CPU seconds per 100,000 recorded messages of what the nodes do beside passing: (reading,
+    decoding, estimating and encoding, writing)."""
+    warm_up(OrientationParams())
+    times = [time.process_time()]
+    with open_bag(bag) as reader:
+        messages = [(topic.lstrip("/"), stamp, cdr) for topic, _, stamp, cdr in reader.messages()]
+    times.append(time.process_time())
+    stream = OrientationStream()
+    stream.reset(TOPICS[:2])
+    made = []
+    for i in range(0, len(messages), BLOCK):
+        block = {topic: [cdr for name, _, cdr in messages[i:i + BLOCK] if name == topic]
+                 for topic in TOPICS[:2]}
+        made += [part for part in stream.take(block) if part.topic == TOPICS[2]]
+    times.append(time.process_time())
+    with BagWriter(folder / "work") as writer:
+        for topic, stamp, cdr in messages:
+            writer.write(f"/{topic}", stream.inputs[topic].layout.msgtype, cdr, stamp)
+        for part in made:
+            for stamp, cdr in zip(part.stamp.tolist(), part.cdrs):
+                writer.write(f"/{part.topic}", IMU.msgtype, cdr, stamp)
+    times.append(time.process_time())
+    return np.diff(times) * 1e5 / (3 * RATE * LONG)
+
+
 def per_100_000(long, short, names):
     """CPU seconds per 100,000 recorded messages, of each process."""
     messages = 3 * RATE * (LONG - SHORT)
@@ -219,9 +248,11 @@ def at_rate_zero(checkouts, runs, folder):
             + ", ".join(f"{s:.0f}" for s in speeds) + " | "
             + ", ".join(f"{c:.1f}" for c in cpu) + f" | {cpu.sum():.1f} | "
             + ", ".join(f"{row[3]:.1f}" for row in rows) + " |")
-    cpu = np.median(bounds, axis=0)
-    lines.append("| bytes published and taken, no work | | | "
-                 + ", ".join(f"{c:.1f}" for c in cpu) + f" | {cpu.sum():.1f} | |")
+    for label, cpu in (("bytes published and taken, no work", np.median(bounds, axis=0)),
+                       ("the work in one process, nothing published or taken",
+                        work_alone(folder / "bag", folder))):
+        lines.append(f"| {label} | | | " + ", ".join(f"{c:.1f}" for c in cpu)
+                     + f" | {cpu.sum():.1f} | |")
     return lines
 
 

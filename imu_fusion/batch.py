@@ -9,16 +9,16 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from imu_fusion.errors import BagError, ImuFusionError, SampleError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.layouts import Decoded, Layout
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.results import FINDINGS, left_out, write_results
 from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.samples.blocks import Growing
 from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.registry import STAGES
@@ -48,10 +48,8 @@ class _Feed:
     def __init__(self, stage: Stage, report: StageReport, names: Mapping[str, str],
                  write: Write | None) -> None:
         self._stage, self._report, self._names, self._write = stage, report, names, write
-        # An index may promise messages that are lost.
-        self._recorded: dict[str, list] = {topic: [(
-            np.empty(0, np.int64), np.empty((0, stage.inputs[topic].width)), [])]
-            for topic in names}
+        self._recorded = {topic: Growing(stage.inputs[topic].width) for topic in names}
+        self._frames: dict[str, dict[str, None]] = {topic: {} for topic in names}
         self._stream = stage.stream(*report.params, warn=report.warnings.append)
         self._stream.concludes = True
         self._stream.reset(list(names))
@@ -66,8 +64,8 @@ class _Feed:
             decoded = block.get((name, kind.layout))
             if decoded is not None:
                 found[topic] = decoded
-                self._recorded[topic].append((decoded.stamp, kind.values(decoded.values),
-                                              [*dict.fromkeys(decoded.frame_ids)]))
+                self._recorded[topic].add(decoded.stamp, kind.values(decoded.values))
+                self._frames[topic] |= dict.fromkeys(decoded.frame_ids)
         try:
             self._hand_on(self._stream.take_decoded(found))
         except BagError:    # of the writer
@@ -78,19 +76,11 @@ class _Feed:
     def finish(self) -> None:
         """The end of the recording: what is held back, and the report."""
         report, stream = self._report, self._stream
-        logs = {topic: self._stage.inputs[topic].log(
-                    np.concatenate([s for s, _, _ in parts]),
-                    np.concatenate([v for _, v, _ in parts]),
-                    next((f[0] for _, _, f in parts if f), ""))
-                for topic, parts in self._recorded.items()}
-        frames = {topic: [frame for *_, own in parts for frame in own]
-                  for topic, parts in self._recorded.items()}
-        del self._recorded
         try:
             report.findings = [
-                *(finding for topic, parts in frames.items()
-                  for finding in check_frames(parts, topic)),
-                *self._stage.findings(logs)]
+                *(finding for topic, named in self._frames.items()
+                  for finding in check_frames(named, topic)),
+                *self._stage.findings(self._logs())]
             if report.skipped:
                 return
             self._hand_on(stream.finish())
@@ -105,6 +95,12 @@ class _Feed:
             report.skipped = str(error)
         finally:
             self._count()
+
+    def _logs(self) -> dict[str, Any]:
+        """What was recorded; it is kept no longer."""
+        return {topic: self._stage.inputs[topic].log(
+                    *self._recorded.pop(topic).take(), next(iter(frames), ""))
+                for topic, frames in self._frames.items()}
 
     def _count(self) -> None:
         report, stream = self._report, self._stream
@@ -122,7 +118,7 @@ class _Feed:
             self._report.written[topic] += 1
 
 
-def process(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
+def process(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
             without: Collection[str] = (), remap: Mapping[str, str] | None = None,
             overwrite: bool = False, progress: Callable[[str], object] = lambda text: None,
             force: bool = False) -> tuple[list[StageReport], list[str]]:
@@ -131,7 +127,7 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
     Args:
         bag: path of a recording.
         out: rosbag2 directory to write.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
         overwrite: replace ``out``.
@@ -149,8 +145,8 @@ def process(bag: str | Path, out: str | Path, params_file: str | Path | None = N
         if name not in STAGES:
             raise TopicError(f"no estimator '{name}'; there are: {', '.join(STAGES)}")
     refuse_source(bag, out)
-    with open_bag(bag) as reader:
-        reports, chosen = _choose(reader, params_file, without, remap or {})
+    with open_bag(bag, remap=remap) as reader:
+        reports, chosen = _choose(reader, params_file, without)
         if not chosen:
             raise TopicError("nothing to do: " + "; ".join(
                 f"{r.node}: {r.skipped}" for r in reports))
@@ -189,15 +185,17 @@ def _found(reports: Sequence[StageReport]) -> dict[str, Any]:
     return {FINDINGS: [*found]} if found else {}
 
 
-def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | None = None,
-             keep: Collection[str] = ()) -> tuple[dict[str, StageReport], dict[str, list[bytes]]]:
+def estimate(bag: str | Path, nodes: Collection[str], params_file: ParamsFile = None,
+             keep: Collection[str] = (), remap: Mapping[str, str] | None = None
+             ) -> tuple[dict[str, StageReport], dict[str, list[bytes]]]:
     """What some estimators say of a recording, without writing it.
 
     Args:
         bag: path of a recording.
         nodes: node names of estimators; one whose topics are missing is skipped.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         keep: topics whose messages are wanted.
+        remap: topic names of ours to those in the recording.
 
     Returns:
         (StageReports by node name, CDR bytes of the topics in ``keep`` in order)
@@ -211,8 +209,8 @@ def estimate(bag: str | Path, nodes: Collection[str], params_file: str | Path | 
         if topic in kept:
             kept[topic].append(cdr)
 
-    with open_bag(bag) as reader:
-        reports, chosen = _choose(reader, params_file, STAGES.keys() - set(nodes), {})
+    with open_bag(bag, remap=remap) as reader:
+        reports, chosen = _choose(reader, params_file, STAGES.keys() - set(nodes))
         for _ in _run(reader, chosen, write, kept.keys()):
             pass
     return {report.node: report for report in reports}, kept
@@ -233,7 +231,7 @@ def _run(reader: Reader, chosen: Sequence[Chosen], write: Write,
         yield one
 
 
-def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageReport], list[Chosen]]:
+def _choose(reader: Reader, params_file, without) -> tuple[list[StageReport], list[Chosen]]:
     """A report per stage, and the stages that can run."""
     reports: list[StageReport] = []
     chosen: list[Chosen] = []
@@ -247,7 +245,7 @@ def _choose(reader: Reader, params_file, without, remap) -> tuple[list[StageRepo
         elif stage.unusable:
             report.skipped = stage.unusable
         else:
-            names, report.skipped = find_inputs(reader, *stage.input_types(), remap)
+            names, report.skipped = find_inputs(reader, *stage.input_types())
             if not report.skipped:
                 chosen.append((stage, report, names))
     return reports, chosen

@@ -18,7 +18,7 @@ import numpy as np
 
 from imu_fusion import kernels
 from imu_fusion.errors import ImuFusionError
-from imu_fusion.signals import held
+from imu_fusion.signals import LEASH, end_with_parent, held
 
 _STEP = 10_000_000     # ns
 _SAMPLES = 400
@@ -138,10 +138,12 @@ def compile_ahead(say: Callable[[str], object]) -> None:
             for job in _JOBS:
                 processes[job] = subprocess.Popen(
                     [sys.executable, "-m", "imu_fusion.compile_ahead", job], text=True,
-                    stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+                    env=os.environ | LEASH, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT)
         for job, process in processes.items():
-            said, _ = process.communicate()
-            if process.returncode:
+            assert process.stdout is not None
+            said = process.stdout.read()    # communicate() would close the leash
+            if process.wait():
                 raise ImuFusionError(f"the kernels of {job} do not compile here: "
                                      + " | ".join(said.strip().splitlines()[-3:]))
     finally:
@@ -172,5 +174,6 @@ def _state() -> str:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     _JOBS[sys.argv[1]]()

@@ -1,7 +1,14 @@
-"""SIGINT, SIGTERM and SIGHUP alike: what runs ends in order, with the code that shells expect."""
+"""SIGINT, SIGTERM and SIGHUP alike: what runs ends in order, with the code that shells expect.
 
+kill -9 gives nobody the time to end what they have started: who starts a process of ours makes its
+standard input a pipe, and :data:`LEASH` says so to it. The pipe closes with whoever holds its other
+end, however that has ended, and what has been started ends as by SIGTERM.
+"""
+
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -9,6 +16,9 @@ from types import FrameType
 came: list[int] = []
 """Signals that :func:`interrupt` has raised: destructors and callbacks swallow exceptions, so who
 waits in a loop looks here, too. What Python would print of that, :func:`handled` leaves out."""
+
+#: For the environment of a process that is to end with the one that starts it.
+LEASH = {"IMU_FUSION_ENDS_WITH_STDIN": "1"}
 
 Handler = Callable[[int, FrameType | None], object]
 
@@ -22,6 +32,21 @@ class Interrupted(BaseException):
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
         self.code = exit_code(number)
+
+
+def end_with_parent() -> None:
+    """To be called by a process as it begins: heed :data:`LEASH`."""
+    if os.environ.items() >= LEASH.items():
+        end_after(lambda: os.read(0, 1))    # nobody writes to it
+
+
+def end_after(wait: Callable[[], object]) -> None:
+    """End this process as by SIGTERM when ``wait()``, called in a thread, returns."""
+    def run() -> None:
+        wait()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=run, daemon=True).start()
 
 
 def exit_code(number: int) -> int:

@@ -4,8 +4,8 @@
         [params_file:=FILE] [report:=true]
 
 Compiles first, where that has not been done. Ends by itself when everything has been played,
-smoothed and recorded, or with a failure when a node fails. `imu_fusion pipeline` does the same
-without launch.
+smoothed and recorded, or with a failure, and without a recording, when a node fails.
+`imu_fusion pipeline` does the same without launch.
 """
 
 import sys

@@ -4,7 +4,7 @@
         [params_file:=FILE]
 
 Compiles first, where that has not been done. Ends by itself when everything has been played and
-recorded, or with a failure when a node fails.
+recorded, or with a failure, and without a recording, when a node fails.
 """
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -25,7 +25,7 @@ def start(context):
         return Node(package="imu_fusion", executable=name, name=name, output="screen",
                     parameters=[given.params_file, parameters])
 
-    recorder = node("recorder", out=given.out)
+    recorder = node("recorder", out=given.out, whole=True)
     others = [node("orientation_estimator"),
               node("replayer", bag=given.bag, rate=given.rate)]
     # The recorder ends by itself when replayer and estimator have said that nothing more comes.

@@ -297,13 +297,17 @@ class Checker:
                 self.complain(f"'{name}': {'.'.join(parts[:count])} has no such name")
 
     def file(self, name):
-        """A path that begins in a folder of ours has to exist; * and <name> stand for anything."""
+        """A path that begins in a folder of ours has to exist; * and <name> stand for anything, and
+        what follows :: is a function in it."""
+        name, _, function = name.partition("::")
         first = name.split("/")[0]
         if "/" not in name or first in ("", "..", ".venv") or not (ROOT / first).is_dir():
             return False
         pattern = re.sub(r"<\w+>", "*", name.rstrip("/"))
         if not (list(ROOT.glob(pattern)) if "*" in pattern else (ROOT / pattern).exists()):
             self.complain(f"no file '{name}'")
+        elif function and f"def {function}(" not in (ROOT / name).read_text():
+            self.complain(f"no function '{function}' in {name}")
         return True
 
     def inline(self, code):

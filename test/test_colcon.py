@@ -21,8 +21,7 @@ PYTHON_KEYS = {"python3-click", "python3-numpy", "python3-pymap3d", "python3-ric
                "python3-scipy", "python3-yaml", "python3-pytest"}
 ROS_KEYS = {"rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "nav_msgs",
             "rosgraph_msgs", "sensor_msgs", "std_msgs", "std_srvs", "launch", "launch_ros",
-            "rcl_interfaces", "tf2_msgs", "tf2_ros", "tf2_ros_py"}
-OPTIONAL = {"tf2_ros"}    # publish_tf alone needs it, and says so where it is missing
+            "rcl_interfaces", "tf2_msgs"}
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +96,7 @@ def test_package_xml_names_keys_that_exist_and_what_the_nodes_import():
                 imported |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 imported.add(node.module.partition(".")[0])
-    assert (imported & ROS_KEYS) - OPTIONAL <= keys
+    assert imported & ROS_KEYS <= keys
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "launch").glob("*.launch.py")),

@@ -13,6 +13,7 @@ from imu_fusion import cli
 from test.documents import PAGES, ROOT, Checker, blocks, commands
 
 TUTORIALS = [page for page in PAGES if page.parent.name == "tutorials"]
+CARRIED_OUT = [ROOT / "README.md", *TUTORIALS]
 ids = dict(ids=lambda page: str(page.relative_to(ROOT)))
 # Shown here, run by the tests of the demos and of the pipeline: they start nodes.
 STARTS_NODES = ("demo", "pipeline", "run", "play", "record")
@@ -61,6 +62,7 @@ def test_what_a_page_names_exists(page, tmp_path):
     ("```\nx\n```", "language ''"),
     ("`imu_fusion demo nothing`", "no demo 'nothing'"),
     ("`config/none.yaml`", "no file"),
+    ("`test/test_docs.py::test_nothing`", "no function 'test_nothing'"),
     ("`imu_fusion.batch.proces`", "no such name"),
     ("`smoother/odometri`", "no topic or service"),
     ("`impact.trigggger`", "no parameter"),
@@ -71,6 +73,31 @@ def test_what_a_page_names_exists(page, tmp_path):
 def test_a_wrong_option_name_path_or_link_is_found(text, words, tmp_path):
     problems = Checker(ROOT / "README.md", text, tmp_path).run()
     assert len(problems) == 1 and words in problems[0], problems
+
+
+def commented(path):
+    """The commands in the comments of a file, a line each."""
+    return re.findall(r"^#\s+((?:imu_fusion|ros2) .*)$", path.read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config").rglob("*.yaml")),
+                         ids=lambda path: path.stem)
+def test_commands_in_comments_of_presets_are_read(path, tmp_path):
+    checker = Checker(path, "", tmp_path)
+    for line in commented(path):
+        for words in commands(line):
+            checker.command(words)
+            assert "--params-file" not in words or words[words.index("--params-file") + 1] == str(
+                path.relative_to(ROOT)), f"{line}: another file"
+    assert not checker.problems, "\n".join(checker.problems)
+
+
+def test_a_wrong_command_in_a_comment_is_found(tmp_path):
+    (tmp_path / "preset.yaml").write_text("# For a bag:\n#   imu_fusion proces BAG OUT\na: 1\n")
+    (line,) = commented(tmp_path / "preset.yaml")
+    checker = Checker(tmp_path / "preset.yaml", "", tmp_path)
+    checker.command(line.split())
+    assert "no command 'imu_fusion proces'" in checker.problems[0]
 
 
 def test_an_old_name_of_a_parameter_is_found(tmp_path, monkeypatch):
@@ -101,9 +128,10 @@ def test_python_that_fails_is_found(folder, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", TUTORIALS, **ids)
-def test_a_tutorial_does_what_it_says(page, folder):
-    """Its files, its Python and its commands, in order, but for those that start nodes."""
+@pytest.mark.parametrize("page", CARRIED_OUT, **ids)
+def test_a_page_does_what_it_says(page, folder):
+    """README and tutorials: their files, Python and commands, in order, but for commands that start
+    nodes."""
     names = {}
     for block in blocks(page.read_text()):
         if block.name:

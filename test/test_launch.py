@@ -107,6 +107,7 @@ def test_nodes_start_when_the_kernels_are_compiled(launched, recording, file):
     assert {"recorder", "replayer", "orientation_estimator"} <= set(launch.names())
     assert set(launch.names()) <= {"compile", *NODES}
     assert all(p.package == "imu_fusion" and p.name == p.executable for p in launch.started[1:])
+    assert launch["recorder"].parameters[1]["whole"]    # a run that fails leaves nothing
 
 
 @pytest.mark.parametrize("file", FILES)
@@ -157,6 +158,8 @@ def test_the_report_comes_after_the_recording(launched, recording):
     ({"rate": "-1"}, ParameterError, "'rate'.*out of bounds"),
     ({"bag": "/nowhere/bag"}, BagError, "/nowhere/bag: no such file"),
     ({"params_file": "/nowhere.yaml"}, ParameterError, "/nowhere.yaml: cannot be read"),
+    ({"out": str(LAUNCH)}, BagError, "exists and is not empty"),
+    ({"out": "/proc/nowhere"}, BagError, "/proc/nowhere: cannot be written"),
 ])
 def test_bad_arguments_are_refused_before_anything_starts(launched, recording, file, given, error,
                                                           words):

@@ -42,19 +42,20 @@ ARROWS = {
     "compile_ahead": ("errors", "kernels", "signals", "geometry", "samples", "surfaces",
                       "estimation.orientation", "estimation.acceleration_field",
                       "estimation.smoother", "messages", "streams"),
+    "arrays": ("errors", "geometry", "samples", "estimation.orientation"),
     "simulation": ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
                    "estimation.acceleration_field"),
     "nodes": ("errors", "kernels", "parameters", "samples", "sensors", "surfaces",
               "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
               "messages", "sources", "sources.transports", "recordings", "streams",
               "compile_ahead", "signals"),
-    "batch": ("errors", "kernels", "messages", "recordings", "samples", "streams"),
+    "batch": ("errors", "kernels", "parameters", "messages", "recordings", "samples", "streams"),
     "report": ("errors", "kernels", "parameters", "geometry", "samples", "surfaces",
                "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
-               "evaluation", "messages", "recordings", "streams", "batch"),
-    "calibrate": ("errors", "geometry", "recordings", "sensors"),
+               "estimation.avalanche", "evaluation", "messages", "recordings", "streams", "batch"),
+    "calibrate": ("errors", "geometry", "recordings", "samples", "sensors"),
     "demos": ("errors", "parameters", "evaluation", "messages", "recordings", "streams", "nodes",
-              "batch", "report"),
+              "batch", "report", "calibrate"),
     "cli": ("errors", "kernels", "parameters", "evaluation", "recordings", "streams",
             "compile_ahead", "nodes", "batch", "report", "calibrate", "demos",
             "signals"),
@@ -72,9 +73,10 @@ ARROWS_OF_FILES = {
 PURE = ("errors", "kernels", "parameters", "geometry", "samples", "sensors", "surfaces",
         "estimation.orientation", "estimation.acceleration_field", "estimation.smoother",
         "estimation.avalanche", "evaluation", "sources")
-COMPUTING = {"abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime",
-             "enum", "functools", "heapq", "itertools", "math", "numbers", "operator", "reprlib",
-             "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag", "pymap3d"}
+COMPUTING = {"abc", "array", "bisect", "collections", "contextlib", "copy", "dataclasses",
+             "datetime", "enum", "functools", "heapq", "itertools", "math", "numbers", "operator",
+             "reprlib", "types", "typing", "warnings", "numba", "numpy", "scipy", "pygeomag",
+             "pymap3d"}
 COMPUTING_OF_FILES = {
     "parameters/bounded_yaml.py": {"pathlib", "yaml"},
     "parameters/file.py": {"pathlib", "yaml"},
@@ -91,7 +93,7 @@ COMPUTING_OF_FILES = {
 }
 ROS = {"rclpy", "launch", "launch_ros", "ament_index_python", "rcl_interfaces", "rosgraph_msgs",
        "builtin_interfaces", "sensor_msgs", "geometry_msgs", "nav_msgs", "std_msgs", "std_srvs",
-       "diagnostic_msgs", "tf2_ros"}
+       "diagnostic_msgs"}
 # Imports by a name that is made at run time hide an arrow.
 HIDDEN = {"importlib", "imp", "pkgutil", "runpy"}
 HIDDEN_OF_FILES = {

@@ -16,7 +16,8 @@ DEMOS = {
     "orientation": "a sensor turned by hand, against an optical reference",
     "impact": "eight accelerometers recover what a clipping gyroscope has missed",
     "drive": "a car, GNSS withheld for a while and compared with RTK",
-    "jump": "a simulated ski jump, against its truth"}
+    "jump": "a simulated ski jump, against its truth",
+    "avalanche": "a simulated ball in an avalanche, against its truth"}
 """Name to what it shows."""
 
 

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.nodes.pipeline import run_pipeline
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.recording import write_recording_report
@@ -15,7 +16,7 @@ from imu_fusion.report.smoother import Smoothed
 from imu_fusion.streams.smoother import SMOOTHED_FIX_TOPIC
 
 
-def replay_and_smooth(bag: Path, out: Path, params_file: Path, console: Console) -> Smoothed:
+def replay_and_smooth(bag: Path, out: Path, params_file: ParamsFile, console: Console) -> Smoothed:
     """Pipeline and report; the Smoothed of the report, which the nodes' output must equal."""
     recording, report = out / "recording", out / "report.html"
     started = time.monotonic()

@@ -22,7 +22,7 @@ WORDS = {st.FLAG_ALIGNING: "aligning", st.FLAG_STILL: "at rest",
          st.FLAG_NO_HEADING: "heading unknown", st.FLAG_MAG_DISTURBED: "magnetic disturbance",
          st.FLAG_MAG_SATURATED: "magnetometer at its limit",
          st.FLAG_SATURATED: "gyroscope at its limit", st.FLAG_GAP: "samples missing",
-         st.FLAG_HELD: "a wild rate held"}
+         st.FLAG_HELD: "a wild sample held"}
 _LASTING = sum(WORDS)
 _WORRIES = ~(st.FLAG_ALIGNING | st.FLAG_STILL)
 _MAG_FLAGS = st.FLAG_MAG_DISTURBED | st.FLAG_MAG_SATURATED

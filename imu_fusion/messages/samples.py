@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 
 from imu_fusion.messages.convert import ABSENT
-from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, Layout
+from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, POSE, TWIST, Layout
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 from imu_fusion.samples.logs import AccelerometerLog, Log
 
 _COVARIANCE_KNOWN = 2     # diagonal
 _GPS = 1
+_END_OF_TIME = 2**31 * NANOSECONDS
 _LAYOUTS: dict[type[Log], Layout] = {
     ImuLog: IMU, AccelerometerLog: IMU, MagLog: MAG, FixLog: FIX, VelocityLog: TWIST,
     PoseLog: POSE}
@@ -24,6 +25,12 @@ class NoiseSd:
     gyr: float = 0.0
     acc: float = 0.0
     mag: float = 0.0
+
+
+def fits_message(stamp: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether a builtin_interfaces/Time can hold stamps (n,) int64 ns (until 2038), and
+    they are not below zero, which no sensor is."""
+    return np.asarray((stamp >= 0) & (stamp < _END_OF_TIME))
 
 
 def msgtype_of(log: Log) -> str:

@@ -45,13 +45,15 @@ NODES = {
 
 def main(args: Sequence[str] | None = None, name: str = "") -> int:
     """Entry point of every executable: start the node that has its name; returns the exit code."""
-    from imu_fusion.signals import Interrupted, came, handled, interrupt
+    from imu_fusion.signals import Interrupted, came, end_with_parent, handled, interrupt
     name = name or Path(sys.argv[0]).stem
-    came.clear()
     try:
         with handled(interrupt):    # from here on: importing takes a second
+            end_with_parent()
             module = importlib.import_module(f"imu_fusion.nodes.{name}")
             base = importlib.import_module("imu_fusion.nodes.base")
             return base.run_node(getattr(module, NODES[name].node), args)
     except Interrupted as signal:
         return signal.code
+    finally:    # not before: what came while this was on its way here is seen by the node
+        came.clear()

@@ -1,8 +1,10 @@
 """What all nodes share: parameters from dataclasses, diagnostics, start and orderly end."""
 
 import importlib
+import math
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -23,6 +25,7 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import INCOMPLETE, ImuFusionError, ParameterError, TopicError
 from imu_fusion.kernels import is_compiling
+from imu_fusion.messages.transforms import TF_TYPE
 from imu_fusion.nodes import NODES
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
@@ -32,10 +35,13 @@ from imu_fusion.signals import Interrupted, came, exit_code, handled, interrupt
 P = TypeVar("P", bound=Parameters)
 
 _WIDE = 2**31 - 1  # of a side without a bound: editors of parameters take no more
+FAREWELL = 2.0  # s, in which a node that was asked to stop ends its session
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
 # Parameters that belong to rclpy, not to us.
 _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+# Groups that a calibration gives to every node (/**): one without that sensor passes by.
+_OF_SENSORS = ("sensor.", "calibration.")
 
 
 def message_class(msgtype: str) -> type:
@@ -50,6 +56,22 @@ def message_class(msgtype: str) -> type:
     except (ImportError, AttributeError, ValueError):
         raise TopicError(f"message type {msgtype} is not installed here; install the ROS package "
                          f"'{msgtype.split('/')[0]}' or leave its topics out") from None
+
+
+def output_class(msgtype: str) -> type:
+    """As :func:`message_class`, of an output.
+
+    Raises:
+        ParameterError: that of /tf is not installed; names the parameter that asks for it.
+    """
+    try:
+        return message_class(msgtype)
+    except TopicError:
+        if msgtype != TF_TYPE:
+            raise
+        raise ParameterError("parameter 'publish_tf': true needs tf2_msgs, which is not here; with "
+                             "an apt ROS: apt install ros-jazzy-tf2-msgs, else set publish_tf "
+                             "false (imu_fusion process writes /tf without it)") from None
 
 
 def descriptor(info: ParameterInfo) -> ParameterDescriptor:
@@ -111,7 +133,7 @@ class Node(rclpy.node.Node):
             self._flow.wait(executor, seconds)
 
     def stop(self) -> None:
-        """Asked to end (signal): do what is needed until ``finished`` is true."""
+        """Asked to end (signal): do what is needed until ``finished`` is true; not for long."""
         self.finished = True
 
     def close(self) -> None:
@@ -161,6 +183,9 @@ class Node(rclpy.node.Node):
                                 if name not in known and name.startswith(self.OPEN_PREFIXES)}
         for name, value in self.open_parameters.items():
             self.declare_parameter(name, value, ParameterDescriptor(read_only=True))
+        for_all = parameter_file.names_for_all(params_files)
+        given = {name: value for name, value in given.items() if name in known
+                 or not (name.startswith(_OF_SENSORS) and name in for_all)}
         unknown = sorted(given.keys() - known.keys())
         if unknown:
             raise ParameterError(f"{unknown_parameter(unknown[0], self.PARAMETERS)} "
@@ -268,11 +293,12 @@ def _run(node_class, params_files):
     node = node_class(params_files=params_files)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    stopping = False
+    deadline = math.inf
     try:
-        while rclpy.ok() and not node.finished and len(came) < 2:
-            if came and not stopping:
-                stopping = True
+        while (rclpy.ok() and not node.finished and len(came) < 2
+               and time.monotonic() < deadline):
+            if came and deadline == math.inf:
+                deadline = time.monotonic() + FAREWELL
                 node.stop()
             else:
                 node.wait(executor, node.work())

@@ -44,7 +44,7 @@ class DeviceFile:
             self.source = file_source(known, description, described_in)
         else:
             raise DeviceError(f"{path}: of no format that is known; a table needs a description")
-        blocks = read_source(path, self.source)
+        blocks = [block for block in read_source(path, self.source) if len(block.log)]
         self._logs: dict[tuple[str, str], Log] = {}
         for key in dict.fromkeys((block.topic, block.clock) for block in blocks):
             joined = Log.joined([b.log for b in blocks if (b.topic, b.clock) == key])

@@ -1,8 +1,7 @@
 """What the driver publishes: one topic each, with covariances and a regard for its rate."""
 
 import time
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from rclpy.qos import QoSProfile
@@ -11,6 +10,7 @@ from imu_fusion.messages.layouts import FIX, IMU, MAG, NANOSECONDS, POSE, TWIST
 from imu_fusion.messages.samples import NoiseSd, sample_messages
 from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.parameters.declare import Parameters
+from imu_fusion.samples.logs import Log
 from imu_fusion.sensors.params import sensor
 from imu_fusion.sources.source import (
     ARRAY_TOPIC,
@@ -66,12 +66,12 @@ class DeviceTopic:
         (before, count), self._asked = self._asked, (time.monotonic(), self.count)
         return (self.count - count) / max(self._asked[0] - before, 1e-9)
 
-    def publish(self, log: Any, stamp: np.ndarray) -> None:
-        """Publish samples under other stamps."""
-        self._regard(stamp)
-        for cdr in sample_messages(replace(log, stamp=stamp), self._noise(), self._frame):
+    def publish(self, log: Log) -> None:
+        """Publish samples."""
+        self._regard(log.stamp)
+        for cdr in sample_messages(log, self._noise(), self._frame):
             self._publisher.publish(cdr)
-        self.count += len(stamp)
+        self.count += len(log)
 
     def _noise(self) -> NoiseSd:
         """Unknown until the rate is known."""

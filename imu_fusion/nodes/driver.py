@@ -1,7 +1,7 @@
 """The driver: samples of a device, under the clock of this computer, on the standard topics."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -13,9 +13,17 @@ from imu_fusion.nodes.device_topics import DeviceTopic, DriverSensor
 from imu_fusion.nodes.flow import reliable_qos, sensor_qos, steady_timer
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.recordings.source_storage import in_range
 from imu_fusion.sources.clock import DeviceClock
 from imu_fusion.sources.registry import FORMATS, HEAD, live_source, recognise
-from imu_fusion.sources.source import ARRAY_TOPIC, FIX_TOPIC, IMU_TOPIC, MAG_TOPIC, Source
+from imu_fusion.sources.source import (
+    ARRAY_TOPIC,
+    FIX_TOPIC,
+    IMU_TOPIC,
+    MAG_TOPIC,
+    Block,
+    Source,
+)
 from imu_fusion.sources.transports.connection import Chunk, Connection
 from imu_fusion.sources.transports.live import open_transport
 
@@ -221,7 +229,9 @@ class Driver(Node):
                 stamp = log.stamp + (lot.arrival - int(log.stamp.max()))
             else:
                 stamp = log.stamp
-            self._outputs[topic].publish(log, stamp)
+            block = in_range(Block(topic, replace(log, stamp=stamp)), self._source)
+            if len(block.log):
+                self._outputs[topic].publish(block.log)
 
     def _play(self, file: DeviceFile) -> float:
         """Publish what is due of a file."""

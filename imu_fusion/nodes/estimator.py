@@ -1,6 +1,5 @@
 """What the nodes of all streaming estimators share: a Stream between DDS topics."""
 
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -8,12 +7,10 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.nodes.base import IDLE, Node, message_class
+from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
 from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream
-
-_FAREWELL = 2.0  # s, in which a node that was asked to stop ends its session
 
 
 class EstimatorNode(Node):
@@ -23,7 +20,7 @@ class EstimatorNode(Node):
         super().__init__(**kwargs)
         self._announcing = ExitStack()
         self._announcing.enter_context(announced_compiling(self.get_logger().info))
-        self._deadline: float | None = None  # of an end that was asked for
+        self._stopping = False
 
     def close(self) -> None:
         self._flow.close()
@@ -35,7 +32,7 @@ class EstimatorNode(Node):
         self._stream: Any = stream  # of the kind that the subclass has made
         self._flow = Flow(self, relays=True)
         self.problems = self._flow.problems
-        self._outputs = {topic: self._flow.output(message_class(msgtype), topic)
+        self._outputs = {topic: self._flow.output(output_class(msgtype), topic)
                          for topic, msgtype in outputs.items()}
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[
             self.params(EstimatorNodeParams).qos]()
@@ -47,7 +44,7 @@ class EstimatorNode(Node):
 
     def work(self) -> float:
         """One turn: take all that waits, one call, publish. See :meth:`Node.work`."""
-        if self._flow.send() and self._deadline is None:  # nothing waits to leave
+        if self._flow.send() and not self._stopping:  # nothing waits to leave
             turn = self._flow.take()
             if turn.begun is not None:
                 self._stream.reset([self._names[topic] for topic in turn.begun])
@@ -60,8 +57,7 @@ class EstimatorNode(Node):
             if turn.event:
                 self.publish(self._stream.finish())
             self._flow.finish(turn)
-        if self._deadline is not None:
-            self.finished = self._flow.source.drained() or time.monotonic() > self._deadline
+        self.finished = self._stopping and self._flow.source.drained()
         return self._flow.pause(IDLE)
 
     def publish(self, made: Sequence[Messages]) -> None:
@@ -72,8 +68,8 @@ class EstimatorNode(Node):
                 output.publish(cdr)
 
     def stop(self) -> None:
-        """End the session, so that whoever listens knows; wait for that only briefly."""
-        self._deadline = time.monotonic() + _FAREWELL
+        """End the session, so that whoever listens knows."""
+        self._stopping = True
         self._flow.close()
 
     def restart(self) -> str:

@@ -14,9 +14,12 @@ from launch.events import Shutdown
 from launch.events.process import ProcessExited
 
 from imu_fusion.errors import ImuFusionError, ParameterError
+from imu_fusion.nodes.recorder import RecorderParams
 from imu_fusion.nodes.replayer import ReplayerParams
-from imu_fusion.parameters.file import load
+from imu_fusion.parameters.file import parameters_for
 from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.targets import refuse_source
 from launch import LaunchContext, LaunchDescriptionEntity
 
 
@@ -42,11 +45,13 @@ def check_arguments(given: Mapping[str, str]) -> LaunchArguments:
         given: name to text, as on the command line.
 
     Raises:
-        BagError, ParameterError: the recording or the parameter file cannot be read, ``rate`` is no
-            speed, or ``report`` neither true nor false.
+        BagError, ParameterError: the recording or the parameter file cannot be read, ``out`` cannot
+            be written, ``rate`` is no speed, or ``report`` neither true nor false.
     """
     open_bag(given["bag"]).close()
-    load(given["params_file"])
+    refuse_source(given["bag"], given["out"])
+    (recorder,) = parameters_for((RecorderParams,), "recorder", given["params_file"])
+    BagWriter(given["out"], overwrite=recorder.overwrite, whole=True).abandon()
     try:
         rate = float(given["rate"])
     except ValueError:

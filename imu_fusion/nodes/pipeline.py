@@ -11,6 +11,7 @@ from pathlib import Path
 
 from imu_fusion.errors import TopicError
 from imu_fusion.nodes.processes import NodeProcesses
+from imu_fusion.parameters.file import ParamsFile, files_of
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inputs import find_inputs
 from imu_fusion.recordings.logs import LogCollector
@@ -33,7 +34,7 @@ class Plan:
     Attributes:
         inputs: of the estimators that have work to do, the smoother among them: their topics to
             those of the recording.
-        renamed: topics of the recording that are played under names of ours.
+        renamed: topics that are played under other names than those in the recording, to these.
         outdated: topics of the recording with earlier estimates, which are not played.
     """
 
@@ -49,12 +50,12 @@ class Plan:
     def replay_parameters(self, bag: str | Path) -> dict:
         """Parameters of the replayer: at full speed, once all nodes have joined."""
         return {"bag": str(Path(bag).absolute()), "rate": 0.0, "exclude": self.outdated,
-                "remap": tuple(f"{name}:=/{topic}" for name, topic in self.renamed.items()),
+                "remap": tuple(f"{name}:={topic}" for topic, name in self.renamed.items()),
                 "wait_for_subscribers": 0,
                 "wait_for_nodes": ("recorder", *self.estimators)}
 
 
-def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
+def plan_pipeline(bag: str | Path, params_file: ParamsFile = None,
                   without: Collection[str] = (), remap: Mapping[str, str] | None = None) -> Plan:
     """What a pipeline would do with a recording; arguments as of :func:`run_pipeline`.
 
@@ -67,27 +68,25 @@ def plan_pipeline(bag: str | Path, params_file: str | Path | None = None,
             raise TopicError(f"no estimator '{name}' to leave out; there are: "
                              + ", ".join(node for node in STAGES if node != SMOOTHER))
     inputs: dict[Stage, Mapping[str, str]] = {}
-    renamed: dict[str, str] = {}
     made: set[str] = set()
-    with open_bag(bag) as reader:
+    with open_bag(bag, remap=remap) as reader:
         for stage in STAGES.values():
             # Here, for a bad file to be refused before anything starts.
             stage, _ = stage.prepare(params_file)
             if stage.node in without or stage.unusable:
                 continue
-            names, missing = find_inputs(reader, *stage.input_types(), remap or {})
+            names, missing = find_inputs(reader, *stage.input_types())
             if missing and stage.node == SMOOTHER:
                 raise TopicError(f"nothing to smooth: {missing}")
             if missing:
                 continue
             inputs[stage] = names
             made |= stage.outputs.keys()
-            renamed |= {name: topic for topic, name in names.items() if name.lstrip("/") != topic}
         outdated = tuple(name for name in reader.topics if name.lstrip("/") in made)
-    return Plan(inputs, renamed, outdated)
+        return Plan(inputs, dict(reader.recorded), outdated)
 
 
-def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | None = None,
+def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
                  without: Collection[str] = (), remap: Mapping[str, str] | None = None,
                  overwrite: bool = False, logs: str | Path | None = None,
                  show: bool = True) -> int:
@@ -98,7 +97,7 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
         out: rosbag2 directory to write: the recording, with old estimates left out, and the
             new ones; results.json beside them as of ``batch.process``. Where a node fails there is
             no recording, and what ``overwrite`` was to replace stays.
-        params_file: ROS 2 parameter file for all nodes, or None for defaults.
+        params_file: ParamsFile, for all nodes; None: defaults.
         without: node names of estimators to leave out.
         remap: dict of topic names of ours to those in the recording.
         overwrite: replace ``out``.
@@ -113,31 +112,33 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: str | Path | Non
     """
     refuse_source(bag, out)
     plan = plan_pipeline(bag, params_file, without, remap)
-    file = Path(params_file).absolute() if params_file else None
+    files = [Path(file).absolute() for file in files_of(params_file)]
     with NodeProcesses(logs) as nodes:
-        nodes.start("recorder", params_file=file, out=str(Path(out).absolute()),
+        nodes.start("recorder", params_file=files, out=str(Path(out).absolute()),
                     overwrite=overwrite, whole=True, end_with_sources=True,
                     expected_sources=(SMOOTHER,))
         for node in plan.estimators:
             own = {"smooth_at_end": True} if node == SMOOTHER else {}
-            nodes.start(node, show=show and node == SMOOTHER, params_file=file, qos="reliable",
+            nodes.start(node, show=show and node == SMOOTHER, params_file=files, qos="reliable",
                         **own)
-        nodes.start("replayer", show=show, params_file=file, **plan.replay_parameters(bag))
+        nodes.start("replayer", show=show, params_file=files, **plan.replay_parameters(bag))
         nodes.wait("replayer", _PATIENCE)
         nodes.wait("recorder", _PATIENCE)
         domain = nodes.domain
+    refused, lost = find_left_out(bag, plan)
     with open_bag(out) as reader:
         found = [results_value(cdr) for _, _, _, cdr in reader.messages([f"/{RESULTS_TOPIC}"])]
-        losses = read_losses(reader)
-    write_results(out, ({SMOOTHER: found[-1]} if found else {})
-                  | left_out(*_left_out(bag, plan, losses)))
+        lost += read_losses(reader)
+    write_results(out, ({SMOOTHER: found[-1]} if found else {}) | left_out(refused, lost))
     return domain
 
 
-def _left_out(bag, plan, losses):
-    """What the guards of the nodes have refused, by node, and what was lost, in words."""
+def find_left_out(bag: str | Path, plan: Plan
+                  ) -> tuple[dict[str, dict[str, dict[str, int]]], list[str]]:
+    """What the nodes of a pipeline leave out of a recording, by node and topic: reasons and how
+    many of each; and what of it cannot be read, in words."""
     refused = {}
-    with open_bag(bag) as reader:
+    with open_bag(bag, remap=plan.renamed) as reader:
         for stage, names in plan.inputs.items():
             found = {}
             for topic, name in names.items():
@@ -149,4 +150,4 @@ def _left_out(bag, plan, losses):
                 found[topic] = guard.refused() | (
                     {UNDECODABLE: undecodable} if undecodable else {})
             refused[stage.node] = {topic: why for topic, why in found.items() if why}
-        return refused, [*(reader.warnings if reader.damaged else ()), *losses]
+        return refused, list(reader.warnings if reader.damaged else ())

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -15,7 +16,8 @@ import yaml
 from imu_fusion.compile_ahead import compile_ahead
 from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.kernels import NOTICE
-from imu_fusion.signals import Interrupted, came, held
+from imu_fusion.parameters.file import ParamsFile, files_of
+from imu_fusion.signals import LEASH, Interrupted, came, held
 
 _CLAIM = 9    # of the ports of a domain, the one that says that nodes will come
 _PATIENCE = 15.0  # s, in which nodes end their sessions and files
@@ -56,14 +58,15 @@ def _bound(port):
 
 
 class NodeProcesses:
-    """Processes of our nodes; leaving the context ends those that still run.
+    """Processes of our nodes; leaving the context ends those that still run, and so does the end of
+    this process, whatever ends it.
 
     Entering it compiles the kernels where that has not been done: nodes that compile would keep
     the others waiting, each for itself.
 
     Args:
         logs: directory for what the nodes print, one file per node; a temporary
-            one if None.
+            one if None, which stays where something fails.
         domain: ROS domain id, a free one if None.
     """
 
@@ -72,6 +75,7 @@ class NodeProcesses:
         if domain is None:
             domain, self._claim = claim_domain()
         self.domain = domain
+        self._is_temporary = logs is None
         self._logs = Path(logs or tempfile.mkdtemp(prefix="imu_fusion_"))
         self._logs.mkdir(parents=True, exist_ok=True)
         self._processes: dict[str, subprocess.Popen] = {}
@@ -81,7 +85,7 @@ class NodeProcesses:
         compile_ahead(_say)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, kind: type[BaseException] | None, *_):
         try:
             for process in self._processes.values():
                 if process.poll() is None:
@@ -95,33 +99,37 @@ class NodeProcesses:
             for process in self._processes.values():
                 process.kill()
                 process.wait()
+                if process.stdin is not None:
+                    process.stdin.close()
             if self._claim is not None:
                 self._claim.close()
+            if self._is_temporary and (kind is None or issubclass(kind, Interrupted)):
+                shutil.rmtree(self._logs, ignore_errors=True)
 
-    def start(self, node: str, show: bool = False, params_file: str | Path | None = None,
+    def start(self, node: str, show: bool = False, params_file: ParamsFile = None,
               **parameters: object) -> None:
         """Start a node.
 
         Args:
             node: module name in imu_fusion.nodes.
             show: let it print here instead of into its log.
-            params_file: ROS 2 parameter file.
+            params_file: ParamsFile.
             parameters: its parameters; empty tuples, which rclpy cannot read, are left out.
         """
         command = [sys.executable, "-m", "imu_fusion.cli", "run", node, "--ros-args"]
-        if params_file is not None:
-            command += ["--params-file", str(params_file)]
+        for file in files_of(params_file):
+            command += ["--params-file", str(file)]
         if parameters:
             own = self._logs / f"{node}.yaml"
             own.write_text(yaml.safe_dump({node: {"ros__parameters": {
                 k: list(v) if isinstance(v, tuple) else v
                 for k, v in parameters.items() if v != ()}}}))
             command += ["--params-file", str(own)]
-        environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain),
-                           ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", PYTHONUNBUFFERED="1")
+        environment = dict(os.environ, ROS_DOMAIN_ID=str(self.domain), PYTHONUNBUFFERED="1",
+                           ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", **LEASH)
         with open(self._logs / f"{node}.log", "w") as log, held():
             self._processes[node] = subprocess.Popen(
-                command, env=environment, stdin=subprocess.DEVNULL,
+                command, env=environment, stdin=subprocess.PIPE,
                 stdout=None if show else log, stderr=None if show else subprocess.STDOUT,
                 start_new_session=True)
 
@@ -164,7 +172,7 @@ class NodeProcesses:
 
     def _last_words(self, node):
         lines = self.log(node).strip().splitlines()
-        return " | ".join(lines[-3:]) or f"nothing in {self._logs / (node + '.log')}"
+        return f"{' | '.join(lines[-3:]) or 'it has printed above'} (logs: {self._logs})"
 
 
 def _say(text):

@@ -18,7 +18,7 @@ from imu_fusion.nodes.base import Node, message_class
 from imu_fusion.nodes.flow import DEPTH, END, NEXT, Flow, reliable_qos, steady_timer
 from imu_fusion.nodes.progress import Progress
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.recordings.bag_reader import find_topic, open_bag
+from imu_fusion.recordings.bag_reader import open_bag
 
 _BURST = 200  # messages sent before services and acknowledgements are looked at
 _BLOCKED = 0.05  # s, wait of the executor while nothing may be sent; callbacks end it
@@ -40,8 +40,10 @@ class ReplayerParams(Parameters):
     start_offset: float = param(0.0, doc="skip this much of the recording", unit="s", low=0)
     duration: float | None = param(None, doc="play this much of the recording", unit="s", low=0)
     loop: bool = param(False, doc="start again at the end")
-    topics: tuple[str, ...] = param((), doc="topics to play, * and ? permitted; empty: all")
-    exclude: tuple[str, ...] = param((), doc="topics to leave out, * and ? permitted")
+    topics: tuple[str, ...] = param((), doc="topics to play, by their recorded or their new names, "
+                                    "* and ? permitted; empty: all")
+    exclude: tuple[str, ...] = param((), doc="topics to leave out, by the names that they are "
+                                     "published by, * and ? permitted")
     remap: tuple[str, ...] = param((), doc="renamed topics, each as recorded:=published")
     clock: float = param(0.0, doc="rate of /clock in real time (at rate 0 in recorded time); "
                          "0: no /clock", unit="Hz", low=0)
@@ -69,7 +71,7 @@ class Replayer(Node):
         if not p.bag:
             raise ParameterError("parameter 'bag' of node replayer: no recording given; "
                                  "add -p bag:=PATH")
-        self._bag = open_bag(p.bag)
+        self._bag = open_bag(p.bag, remap=_remapping(p.remap))
         for warning in self._bag.warnings:
             self.get_logger().warning(warning)
         self._start = self._bag.start_time + round(p.start_offset * 1e9)
@@ -89,11 +91,11 @@ class Replayer(Node):
         self._from = self._start  # where the next session begins
         self._seek: int | None = None  # where it is to begin as soon as this one has ended
         self._messages: Iterator[tuple[str, str, int, bytes]] = iter(())
-        self._next = None  # (topic, log time, bytes) that is due next
+        self._next = None  # of them, not yet sent
         self._phase = self._wait
         self._waiting_since = time.monotonic()
         self._last_event = None
-        self._deadline = None  # of an end that was asked for
+        self._stopping = False
         self._paused = p.start_paused
         self._steps = 0
         self._pace = 1.0
@@ -109,8 +111,6 @@ class Replayer(Node):
 
     def work(self) -> float:
         """Do what the present phase asks for; see :meth:`Node.work`."""
-        if self._deadline is not None and time.monotonic() > self._deadline:
-            self.finished = True
         self._flow.send()
         if self._seek is not None:
             self._jump(self._seek)
@@ -126,13 +126,13 @@ class Replayer(Node):
             raise ParameterError(
                 f"parameter 'seek': {seek:g} s is not in what is played, "
                 f"{(self._start - zero) * 1e-9:g} to {(self._stop - zero) * 1e-9:g} s")
-        if self._deadline is not None or (self._phase == self._drain and self._last_event == END):
+        if self._stopping or (self._phase == self._drain and self._last_event == END):
             raise ParameterError("parameter 'seek': everything has been played; see loop")
         self._seek = target
 
     def stop(self) -> None:
-        """End the session, so that whoever listens knows; wait for that only briefly."""
-        self._deadline = time.monotonic() + 2.0
+        """End the session, so that whoever listens knows."""
+        self._stopping = True
         self._next = None
         if self._phase == self._wait:
             self.finished = True
@@ -154,9 +154,8 @@ class Replayer(Node):
                   file=sys.stderr)
 
     def _make_publishers(self, p):
-        """Publishers of the selected topics, by recorded name."""
+        """Publishers of the selected topics, by name."""
         names = _selected(self._bag, p)
-        renamed = _remapping(self._bag, p.remap)
         publishers = {}
         for name in names:
             info = self._bag.topics[name]
@@ -168,7 +167,7 @@ class Replayer(Node):
                 self.get_logger().warning(f"{name} is not played: {error}")
                 continue
             latched = any(q["durability"] == "transient_local" for q in info.qos_profiles)
-            publishers[name] = self._flow.output(cls, renamed.get(name, name), reliable_qos(
+            publishers[name] = self._flow.output(cls, name, reliable_qos(
                 DEPTH, DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
         if not publishers:
             raise TopicError(f"{p.bag}: nothing to play; it has "
@@ -197,9 +196,9 @@ class Replayer(Node):
 
     def _begin(self):
         # Asked to end after NEXT has been promised: the next session is empty.
-        if self._deadline is None:
+        if not self._stopping:
             self._messages = self._bag.messages(list(self._outputs), self._from, self._stop)
-            self._advance()
+            self._next = next(self._messages, None)
         self._source.begin()
         self._anchor = None
         self._next_clock = 0
@@ -209,7 +208,7 @@ class Replayer(Node):
     def _join(self):
         """All our nodes on the graph must have answered."""
         if self._next is not None:
-            self._publish_clock(self._next[1])
+            self._publish_clock(self._next[2])
             self._next_clock = 0
         if not self._source.ready():
             self._give_up_after(self.params(ReplayerParams).wait_timeout,
@@ -220,28 +219,28 @@ class Replayer(Node):
         return 0.0
 
     def _play(self):
-        for _ in range(_BURST):
-            if self._next is None:
-                again = self.params(ReplayerParams).loop and self._deadline is None
-                self._from = self._start
-                self._end(NEXT if again else END)
-                return 0.0
-            if self._paused and not self._steps:
-                self._anchor = None
+        """Publish what is due, as far as it may leave; in a pause, as many as were asked for."""
+        if self._next is None:
+            again = self.params(ReplayerParams).loop and not self._stopping
+            self._from = self._start
+            self._end(NEXT if again else END)
+            return 0.0
+        due = self._due(self._next[2])
+        for _ in range(self._steps if self._paused else _BURST):
+            topic, _, log_time, data = self._next
+            if log_time > due:
+                return min((log_time - due) * 1e-9 / self._pace, _BLOCKED)
+            output = self._outputs[topic]
+            if not output.is_open():
                 return _BLOCKED
-            topic, log_time, data = self._next
-            publisher = self._outputs[topic]
-            if publisher.waiting or not publisher.is_open():
-                return _BLOCKED
-            if not self._steps:
-                wait = self._time_to_wait(log_time)
-                if wait > 0.0:
-                    return min(wait, _BLOCKED)
             self._publish_clock(log_time)
-            publisher.publish(data)
-            self._steps -= self._steps > 0
-            self._advance()
-        return 0.0
+            output.publish(data)
+            self._steps -= self._paused
+            self._next = next(self._messages, None)
+            if self._next is None:
+                return 0.0
+        self._progress.update((self._next[2] - self._start) * 1e-9)
+        return _BLOCKED if self._paused else 0.0
 
     def _drain(self):
         """Everything is sent; our nodes say when they have it."""
@@ -258,25 +257,18 @@ class Replayer(Node):
         self._source.end(event)
         self._phase = self._drain
 
-    def _advance(self):
-        item = next(self._messages, None)
-        self._next = None if item is None else (item[0], item[2], item[3])
-        if item is not None:
-            self._progress.update((item[2] - self._start) * 1e-9)
-
-    def _time_to_wait(self, log_time):
-        """Seconds until a message of this log time is due."""
+    def _due(self, log_time):
+        """Log time up to which messages are due; ``log_time`` is that of the next one."""
         p = self.params(ReplayerParams)
-        pace = p.rate
-        if pace == 0.0 and self._source.foreign:
-            pace = p.foreign_rate
+        if self._paused:
+            self._anchor = None
+            return math.inf
+        pace = p.foreign_rate if p.rate == 0.0 and self._source.foreign else p.rate
         now = time.monotonic()
         if self._anchor is None or pace != self._pace:
             self._anchor, self._pace = (now, log_time), pace
-        if pace == 0.0:
-            return 0.0
         started, first = self._anchor
-        return started + (log_time - first) * 1e-9 / pace - now
+        return first + round((now - started) * pace * 1e9) if pace else math.inf
 
     def _publish_clock(self, log_time):
         if self._clock_out is not None and log_time >= self._next_clock:
@@ -320,7 +312,7 @@ class Replayer(Node):
         return "paused"
 
     def _resume(self):
-        self._paused = False
+        self._paused, self._steps = False, 0
         return "playing"
 
     def _step(self):
@@ -333,36 +325,35 @@ class Replayer(Node):
 
 
 def _selected(bag, p):
-    """Recorded names of the topics to play.
+    """Names of the topics to play.
 
     Raises:
         TopicError: one that was asked for is not there.
     """
-    def matches(name, patterns):
+    def matches(patterns, *names):
         return any(fnmatch.fnmatchcase(name.lstrip("/"), pattern.lstrip("/"))
-                   for pattern in patterns)
+                   for name in names for pattern in patterns)
+
+    def asked(name, patterns):
+        return matches(patterns, name, bag.recorded.get(name, name))
 
     for pattern in p.topics:
-        if not any(matches(name, [pattern]) for name in bag.topics):
+        if not any(asked(name, [pattern]) for name in bag.topics):
             bag.require(pattern)
     return [name for name in bag.topics
-            if (not p.topics or matches(name, p.topics)) and not matches(name, p.exclude)]
+            if (not p.topics or asked(name, p.topics)) and not matches(p.exclude, name)]
 
 
-def _remapping(bag, rules):
-    """{recorded name: published name}.
+def _remapping(rules):
+    """{published name: recorded name}.
 
     Raises:
-        ParameterError: a rule is malformed or its topic is not in the recording.
+        ParameterError: a rule is malformed.
     """
     renamed = {}
     for rule in rules:
         old, separator, new = rule.partition(":=")
-        name = find_topic(bag.topics, old)
-        if not separator or not new:
+        if not (old and separator and new):
             raise ParameterError(f"parameter 'remap': '{rule}' is not recorded:=published")
-        if name is None:
-            raise ParameterError(f"parameter 'remap': no topic '{old}' in the recording; it has: "
-                                 + ", ".join(bag.topics))
-        renamed[name] = new
+        renamed[new] = old
     return renamed

@@ -17,12 +17,11 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from imu_fusion.errors import EstimationError, ImuFusionError, ParameterError, TopicError
-from imu_fusion.estimation.smoother.result import SAMPLE
+from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.messages.transforms import TF_TYPE
-from imu_fusion.nodes.base import IDLE, Node, message_class
+from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
 from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
+from imu_fusion.signals import end_after
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
     INPUTS,
@@ -37,7 +36,7 @@ from imu_fusion.streams.stream import one_by_one
 from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
-_PIECE = 10_000  # samples that the child sends at once
+_INPUT, _SAMPLES, _OUTCOME = "input", "samples.npy", "outcome"  # files of the child
 _SLICE = 200  # messages published between callbacks
 
 
@@ -45,85 +44,63 @@ def _latched(count):
     return reliable_qos(count, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def _class_of(msgtype):
-    """As message_class; where that of /tf is missing, the parameter that asks for it is named."""
+def _smooth_in_child(folder):
+    """Entry point of the child process: its input lies in a folder, and there it leaves samples
+    and their Outcome, or the reason why there are none."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end_after(parent.join)
+    folder = Path(folder)
+    outcome: smoothing.Outcome | str
     try:
-        return message_class(msgtype)
-    except TopicError:
-        if msgtype != TF_TYPE:
-            raise
-        raise ParameterError("parameter 'publish_tf': true needs tf2_msgs, which is not here; with "
-                             "an apt ROS: apt install ros-jazzy-tf2-msgs, else set publish_tf "
-                             "false (imu_fusion process writes /tf without it)") from None
-
-
-def _smooth_in_child(connection, file):
-    """Entry point of the child process: sends an Outcome and the number of samples, then these
-    in pieces; or the reason why there are none."""
-    try:
-        params, logs = pickle.loads(Path(file).read_bytes())
+        params, logs = pickle.loads((folder / _INPUT).read_bytes())
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smoothing.smooth(params, logs)
-        samples = result.samples
+        np.save(folder / _SAMPLES, result.samples)
         outcome = smoothing.Outcome.of(result, logs[smoothing.IMU_TOPIC].frame_id)
-        connection.send((outcome, len(samples)))
-        for i in range(0, len(samples), _PIECE):
-            connection.send_bytes(samples[i:i + _PIECE].tobytes())
     except ImuFusionError as error:
-        connection.send((str(error), 0))
+        outcome = str(error)
     except KeyboardInterrupt:
-        pass  # the parent is ending, too
+        return  # the parent is ending, too
     except Exception as error:
         traceback.print_exc()
-        connection.send((f"smoothing failed: {type(error).__name__}: {error}", 0))
+        outcome = f"smoothing failed: {type(error).__name__}: {error}"
+    (folder / _OUTCOME).write_bytes(pickle.dumps(outcome))
 
 
 class _Child:
-    """A child process that smooths, and what has come from it."""
+    """A child process that smooths."""
 
     def __init__(self, params, logs):
-        spawn = multiprocessing.get_context("spawn")
-        self._pipe, theirs = spawn.Pipe(duplex=False)
-        # In a file: a child that is killed before it has read its arguments stalls its parent.
-        self._file = tempfile.NamedTemporaryFile(prefix="imu_fusion_")  # noqa: SIM115, see close
-        pickle.dump((params, logs), self._file)
-        self._file.flush()
-        self._process = spawn.Process(target=_smooth_in_child, daemon=True,
-                                      args=(theirs, self._file.name))
+        self._folder = tempfile.TemporaryDirectory(prefix="imu_fusion_")
+        # Files: a child that is killed before it has read its arguments would stall its parent.
+        with open(Path(self._folder.name) / _INPUT, "wb") as stream:
+            pickle.dump((params, logs), stream)
+        self._process = multiprocessing.get_context("spawn").Process(
+            target=_smooth_in_child, daemon=True, args=(self._folder.name,))
         self._process.start()
-        theirs.close()
-        self.samples: Any = None
-        self.outcome: Any = None  # an Outcome, or the reason why there is none
-        self._received = 0
 
-    def poll(self):
-        """Take what has come; whether that is all."""
-        try:
-            if self._pipe.poll():
-                if self.outcome is None:
-                    self.outcome, count = self._pipe.recv()
-                    self.samples = np.empty(count, SAMPLE)
-                else:
-                    piece = np.frombuffer(self._pipe.recv_bytes(), SAMPLE)
-                    self.samples[self._received:self._received + len(piece)] = piece
-                    self._received += len(piece)
-                return self._received == len(self.samples)
-        except EOFError:
-            pass
-        else:
-            if self._process.is_alive() or self._pipe.poll():
-                return False
-        self._process.join()
-        self.outcome = ("the smoothing process ended without an answer (exit code "
-                        f"{self._process.exitcode}): out of memory?")
-        return True
+    def is_done(self):
+        """Whether it has ended."""
+        return not self._process.is_alive()
+
+    def result(self):
+        """(samples, Outcome), or the reason why there are none."""
+        folder = Path(self._folder.name)
+        if self._process.exitcode or not (folder / _OUTCOME).exists():
+            return ("the smoothing process ended without an answer (exit code "
+                    f"{self._process.exitcode}): out of memory?")
+        outcome = pickle.loads((folder / _OUTCOME).read_bytes())
+        if isinstance(outcome, str):
+            return outcome
+        # Mapped: read piece by piece, as they are published.
+        return np.load(folder / _SAMPLES, mmap_mode="r"), outcome
 
     def close(self):
         """End the process: it has nothing more to say, or nobody listens any more."""
         self._process.kill()
         self._process.join()
-        self._pipe.close()
-        self._file.close()
+        self._folder.cleanup()
 
 
 class SmootherNode(Node):
@@ -141,7 +118,7 @@ class SmootherNode(Node):
         # What is refused is refused before others see a reader of ours and wait for its answer.
         if smoothing_params.surface.file:
             load_surface(smoothing_params.surface.file)
-        types = {topic: _class_of(msgtype)
+        types = {topic: output_class(msgtype)
                  for topic, msgtype in outputs_of(smoothing_params).items()}
         self._stream = SmootherStream(smoothing_params, p.memory_limit * 1e6,
                                       self.get_logger().warning)
@@ -172,13 +149,17 @@ class SmootherNode(Node):
         if turn.blocks:
             self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
                                for topic, messages in turn.blocks.items()})
+        if turn.ended:
+            self._stream.end([self._names[topic] for topic in turn.ended])
+        if turn.event:
+            self._stream.finish()    # a last sample after a long pause waits for one after it
         self._flow.finish(turn)
         if self._at_end and turn.event == END:
             self._insist(self._replay_broke_off(turn.over) or self._start())
         if self._child is not None:
             # The executor polls the coroutine of a waiting service without rest.
             time.sleep(_POLL)
-            if self._child.poll():
+            if self._child.is_done():
                 self._conclude()
             return 0.0
         return 0.0 if self._publish() else self._flow.pause(IDLE)
@@ -233,17 +214,18 @@ class SmootherNode(Node):
     def _conclude(self):
         """The child has said all: answer."""
         child, self._child = self._child, None
+        result = child.result()
         child.close()
-        if isinstance(child.outcome, str):
-            self._answer.set_result((False, child.outcome))
+        if isinstance(result, str):
+            self._answer.set_result((False, result))
             if self._at_end:
-                self._insist(child.outcome)
-            self.get_logger().info(child.outcome)
+                self._insist(result)
+            self.get_logger().info(result)
             return
-        message = "; ".join([child.outcome.summary, *child.outcome.remarks])
+        _, outcome = self._result = result
+        message = "; ".join([outcome.summary, *outcome.remarks])
         self.get_logger().info(message)
         self._answer.set_result((True, message))
-        self._result = child.samples, child.outcome
 
     def _publish(self):
         """Publish some of a result, as the subscribers take it; whether more could follow now.

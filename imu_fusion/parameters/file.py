@@ -2,13 +2,28 @@
 
 from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import yaml
 
 from imu_fusion.errors import ParameterError
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, flatten, unknown_parameter
+
+#: A parameter file, several (of which the last that names a value counts, as in ROS 2), or none.
+ParamsFile: TypeAlias = str | Path | Sequence[str | Path] | None
+
+
+def files_of(given: ParamsFile) -> tuple[str | Path, ...]:
+    """The parameter files that were given, in order."""
+    if given is None:
+        return ()
+    return (given,) if isinstance(given, (str, Path)) else tuple(given)
+
+
+def source_of(given: ParamsFile) -> str:
+    """Where parameters come from, in words for a message: the files, empty without any."""
+    return ", ".join(map(str, files_of(given)))
 
 
 def dump(node: str, values: dict[str, Any]) -> str:
@@ -56,14 +71,14 @@ def _walk(path: Path, content: Any, prefix: str = "") -> Iterator[tuple[str, dic
             yield from _walk(path, body, f"{prefix}{key}/")
 
 
-def parameters_for(classes: Sequence[type[Parameters]], node: str, path: str | Path | None = None,
+def parameters_for(classes: Sequence[type[Parameters]], node: str, path: ParamsFile = None,
                    ignore: Sequence[str] = ()) -> list[Any]:
     """The parameters of one node from a file, or its defaults without one.
 
     Args:
         classes: the :class:`~imu_fusion.parameters.declare.Parameters` classes of the node.
         node: node name; ``/**`` in the file applies to every node, with the names known to it.
-        path: the file, or None.
+        path: ParamsFile.
         ignore: names (or prefixes ending in a dot) that are read by somebody else.
 
     Returns:
@@ -72,7 +87,7 @@ def parameters_for(classes: Sequence[type[Parameters]], node: str, path: str | P
     Raises:
         ParameterError: unknown name, wrong type, value out of bounds; names the file.
     """
-    if path is None:
+    if not files_of(path):
         return [cls() for cls in classes]
     known = {info.name for cls in classes for info in cls.infos()}
     old = {name for cls in classes for name in cls.OLD_NAMES}
@@ -80,12 +95,12 @@ def parameters_for(classes: Sequence[type[Parameters]], node: str, path: str | P
     for name in values:
         if name not in known and not any(
                 name == i or (i.endswith(".") and name.startswith(i)) for i in ignore):
-            raise ParameterError(f"{unknown_parameter(name, classes)} (from {path})")
-    resolve_paths(values, classes, node, [path])
+            raise ParameterError(f"{unknown_parameter(name, classes)} (from {source_of(path)})")
+    resolve_paths(values, classes, node, files_of(path))
     result = []
     for cls in classes:
         own = {info.name for info in cls.infos()}
-        result.append(cls.from_mapping(values, source=str(path), ignore=(*ignore, *(known - own))))
+        result.append(cls.from_mapping(values, source_of(path), (*ignore, *(known - own))))
     return result
 
 
@@ -111,15 +126,19 @@ def resolve_paths(values: dict[str, Any], classes: Iterable[type[Parameters]], n
                 break
 
 
-def node_values(node: str, path: str | Path | None, known: Container[str]) -> dict[str, Any]:
-    """Names and values, dotted, that a file gives to a node: of ``/**`` only the known ones.
+def names_for_all(paths: Iterable[str | Path]) -> set[str]:
+    """Dotted names that files give to every node (``/**``): a node passes by those that it does
+    not know."""
+    return {name for path in paths for name in flatten(load(path).get("**", {}))}
 
-    An empty dict without a file (path None).
-    """
-    if path is None:
-        return {}
-    nodes = load(path)
-    values = {name: value for name, value in flatten(nodes.get("**", {})).items() if name in known}
-    values.update(flatten(nodes.get(node, {})))
+
+def node_values(node: str, path: ParamsFile, known: Container[str]) -> dict[str, Any]:
+    """Names and values, dotted, that files give to a node: of ``/**`` only the known ones."""
+    values: dict[str, Any] = {}
+    for file in files_of(path):
+        nodes = load(file)
+        values.update({name: value for name, value in flatten(nodes.get("**", {})).items()
+                       if name in known})
+        values.update(flatten(nodes.get(node, {})))
     values.pop("use_sim_time", None)
     return values

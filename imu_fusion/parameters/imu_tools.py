@@ -17,15 +17,15 @@ from imu_fusion.parameters.file import load
 _SAME = {"world_frame": ("world_frame", None), "fixed_frame": ("fixed_frame", None),
          "publish_tf": ("publish_tf", None), "declination": ("declination_deg", 180.0 / math.pi),
          "yaw_offset": ("alignment.yaw_offset_deg", 180.0 / math.pi),
-         "remove_gravity_vector": ("remove_gravity_vector", None)}
+         "remove_gravity_vector": ("remove_gravity_vector", None),
+         "do_bias_estimation": ("fusion.estimate_bias", None)}
 _MAG_BIAS = ("mag_bias_x", "mag_bias_y", "mag_bias_z")
 _GAIN = "there is no gain: sensor.* and fusion.* state noise, and the filter weighs by it"
 #: Their name: (the value that asks for nothing, why it has no counterpart).
 _NONE: dict[str, tuple[Any, str]] = {
-    "gain": (None, _GAIN), "zeta": (None, "the gyroscope's bias is always estimated; "
+    "gain": (None, _GAIN), "zeta": (None, "no gain for the gyroscope's bias either: "
                                     "sensor.gyro_bias_walk says how fast it may drift"),
     "gain_acc": (None, _GAIN), "gain_mag": (None, _GAIN), "bias_alpha": (None, _GAIN),
-    "do_bias_estimation": (True, "the bias is always estimated"),
     "do_adaptive_gain": (True, "accelerations are always told from gravity"),
     "orientation_stddev": (0.0, "the covariance is estimated, in imu/data"),
     "orientation_variance": (0.0, "the covariance is estimated, in imu/data"),

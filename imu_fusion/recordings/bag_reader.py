@@ -7,8 +7,8 @@ together, and where it contradicts them it is said and not believed.
 """
 
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -52,7 +52,8 @@ class TopicInfo:
     qos_profiles: list[dict] = field(default_factory=list)
 
 
-def open_bag(path: str | Path, description: str | Path | None = None) -> "Reader":
+def open_bag(path: str | Path, description: str | Path | None = None,
+             remap: Mapping[str, str] | None = None) -> "Reader":
     """Open a recording for reading: a context manager with ``topics`` and ``messages``.
 
     Args:
@@ -61,9 +62,11 @@ def open_bag(path: str | Path, description: str | Path | None = None) -> "Reader
             :mod:`imu_fusion.sources.registry`.
         description: YAML file that says what a table of a device holds, or what the export of a
             device does not tell.
+        remap: names of topics to those in the recording; see :meth:`Reader.rename`.
 
     Raises:
         BagError: nothing there, not a recording, or damaged beyond reading.
+        TopicError: ``remap`` names a topic that is not there.
         SampleError, ParameterError: the file of a device, or the description, is not usable.
     """
     path = Path(path)
@@ -83,6 +86,7 @@ def open_bag(path: str | Path, description: str | Path | None = None) -> "Reader
         except (MemoryError, RecursionError, ArithmeticError, LookupError, TypeError) as error:
             raise BagError(f"{path}: damaged beyond reading ({type(error).__name__}: {error})"
                            ) from error
+        reader.rename(remap or {})
     except BaseException:
         reader.close()
         raise
@@ -141,7 +145,8 @@ def _named(path: Path, files: list[Path], warnings: list[str]) -> list[Path]:
 class Reader:
     """A recording; ``warnings`` says what is wrong with it, as far as it is known by now: what is
     damaged inside is found while it is read. ``damaged`` tells whether anything is lost,
-    ``format`` what a device's file was taken for."""
+    ``format`` what a device's file was taken for. ``recorded`` maps topics that go by another name
+    to the one in the recording."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -150,6 +155,7 @@ class Reader:
         self.warnings: list[str] = []
         self.damaged = False    # messages are lost
         self.format = ""
+        self.recorded: dict[str, str] = {}
         self._nested: dict[str, tuple[str, Nested]] = {}    # topic.field: (topic, what is there)
         self._storages: list[Storage] = []
         self._stored: dict[str, StoredTopic] = {}
@@ -209,6 +215,29 @@ class Reader:
         self.start_time, self.end_time = self._storages[0].times
         self.end_time += 1
 
+    def rename(self, remap: Mapping[str, str]) -> None:
+        """Call topics by other names from here on. One that has such a name already cannot be seen
+        any more; ``warnings`` says so.
+
+        Args:
+            remap: new names to those in the recording, also of messages inside of others; see
+                :meth:`find`.
+
+        Raises:
+            TopicError: a topic is not there.
+        """
+        taken = {name: self.require(other).name for name, other in remap.items()}
+        infos = {name: self.topics[other] for name, other in taken.items()}
+        for other in taken.values():
+            self.topics.pop(other, None)
+        for name, info in infos.items():
+            hidden = find_topic(self.topics, name)
+            if hidden is not None:
+                self.mention(f"{hidden} of the recording is left out: {info.name} goes by its name")
+                del self.topics[hidden]
+            self.recorded[name] = info.name
+            self.topics[name] = replace(info, name=name)
+
     def close(self) -> None:
         """Release the files."""
         for storage in self._storages:
@@ -229,9 +258,10 @@ class Reader:
             BagError: the file can no longer be read. What is damaged in it is no error but left
                 out: see ``warnings``.
         """
-        wanted = {name for name in self.topics if topics is None or name in topics}
-        fields = {name: self._nested[name] for name in wanted if name in self._nested}
-        asked = wanted - fields.keys()
+        shown = {self.recorded.get(name, name): info for name, info in self.topics.items()
+                 if topics is None or name in topics}
+        fields = {name: self._nested[name] for name in shown if name in self._nested}
+        asked = shown.keys() - fields.keys()
         wanted = asked | {topic for topic, _ in fields.values()}
         parts = [Part(storage.times[0] if storage.times else 0, 0,
                       partial(storage.messages, wanted, start, stop))
@@ -245,11 +275,12 @@ class Reader:
                         continue
                     data = unpacked
                 if topic in asked:
-                    yield topic, self.topics[topic].msgtype, log_time, data
+                    yield shown[topic].name, shown[topic].msgtype, log_time, data
                 for name, (holder, member) in fields.items():
                     if holder == topic:
                         try:
-                            yield name, member.msgtype, log_time, member.extract(data)
+                            yield (shown[name].name, member.msgtype, log_time,
+                                   member.extract(data))
                         except MessageError as error:
                             self.lose(f"{name}: messages cannot be decoded and are left out "
                                       f"({error})")
@@ -292,7 +323,7 @@ class Reader:
             inside = nested(self.topics[topic].msgtype, definition[0], field)
             if inside is not None:
                 full = f"{topic}.{field}"
-                self._nested[full] = topic, inside
+                self._nested[full] = self.recorded.get(topic, topic), inside
                 self._stored[full] = StoredTopic(full, inside.msgtype)
                 self.topics[full] = TopicInfo(full, inside.msgtype, self.topics[topic].count,
                                               self.topics[topic].qos_profiles)
@@ -302,7 +333,7 @@ class Reader:
     def definition(self, topic: str) -> tuple[str, str] | None:
         """(ros2msg definition with its dependencies, RIHS01 hash) of the type of a topic, as the
         recording has it, else as ROS 2 Jazzy does; None if neither knows it."""
-        info = self._stored[topic]
+        info = self._stored[self.recorded.get(topic, topic)]
         if info.definition is None and info.msgtype in TYPES.fielddefs:
             info.definition = (TYPES.generate_msgdef(info.msgtype, ros_version=2)[0],
                                TYPES.hash_rihs01(info.msgtype))

@@ -16,7 +16,13 @@ from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.recordings.mcap_writer import McapWriter
 from imu_fusion.recordings.qos import qos_profile
-from imu_fusion.recordings.targets import LIBRARY, METADATA_FILE, why_not_replaced
+from imu_fusion.recordings.targets import (
+    LIBRARY,
+    METADATA_FILE,
+    make_parents,
+    remove_empty,
+    why_not_replaced,
+)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -52,6 +58,7 @@ class BagWriter:
         self._target = Path(directory).resolve()
         self.directory = self._target
         self._replaced: Path | None = None    # where what was there is kept until the end
+        self._folders: list[Path] = []        # that were made for it, innermost first
         self._whole = whole
         self.counts: Counter[str] = Counter()
         self._channels: dict[str, int] = {}
@@ -78,7 +85,7 @@ class BagWriter:
                 if why or not overwrite:
                     raise BagError(f"{target}: exists and is not empty; choose another directory"
                                    + (f" ({why})" if why else ""))
-            target.parent.mkdir(parents=True, exist_ok=True)
+            self._folders = make_parents(target)
             if self._whole:
                 # Inside of an empty directory that is there: it may be a mount point.
                 inside = target.is_dir() and not occupied
@@ -104,6 +111,7 @@ class BagWriter:
             shutil.rmtree(self.directory)
         if self._replaced is not None:
             os.rename(self._replaced, self._target)
+        remove_empty(self._folders)
 
     def _appear(self):
         """Put the complete recording at its place; let go of what it replaces."""

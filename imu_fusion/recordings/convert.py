@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from imu_fusion.errors import BagError
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.recordings.array_parameters import array_parameters
-from imu_fusion.recordings.bag_reader import Reader, open_bag
+from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.repair import copy
 from imu_fusion.recordings.targets import refuse_files, refuse_source
@@ -44,7 +44,8 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
         source, description: see there. With accelerometers of an array in the description,
             ``<out>.yaml`` becomes the parameter file of their estimator.
         out: rosbag2 directory to write. overwrite: replace it, and the parameter file.
-        topics: those to keep; all, if empty. remap: names of ours to those in the source.
+        topics: those to keep, by either name; all, if empty. remap: names of ours to those in the
+            source.
         watch: makes a context that passes messages on, given them and how many they are.
 
     Raises:
@@ -56,7 +57,7 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
     refuse_source(source, out)
     if description is not None:
         refuse_source(description, out)
-    with open_bag(source, description) as reader:
+    with open_bag(source, description, remap) as reader:
         text = ""
         array = None if description is None else _array(description)
         if description is not None and array is not None:
@@ -65,20 +66,22 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
                 raise BagError(f"{parameter_file}: exists already; choose another name or "
                                "--overwrite")
             text = _parameters(reader, array, Path(description))
-        kept = [reader.require(topic).name for topic in topics] or list(reader.topics)
-        renamed = {reader.require(other).name: name for name, other in (remap or {}).items()}
-        with BagWriter(out, overwrite=overwrite, whole=True) as writer:
-            messages: Messages = reader.messages(kept)
-            if watch is None:
-                copy(reader, writer, kept, renamed, messages)
-            else:
-                with watch(messages, sum(reader.topics[t].count or 0 for t in kept)) as watched:
-                    copy(reader, writer, kept, renamed, watched)
-            beside = parameter_file.with_name(f".{parameter_file.name}.part")
+        named = {other: name for name, other in reader.recorded.items()}
+        kept = [reader.require(named.get(find_topic(named, topic) or "", topic)).name
+                for topic in topics] or list(reader.topics)
+        beside = parameter_file.with_name(f".{parameter_file.name}.part")
+        try:
+            with BagWriter(out, overwrite=overwrite, whole=True) as writer:
+                messages: Messages = reader.messages(kept)
+                with (nullcontext(messages) if watch is None else watch(
+                        messages, sum(reader.topics[t].count or 0 for t in kept))) as watched:
+                    copy(reader, writer, kept, watched)
+                if text:
+                    _write(beside, text, parameter_file)
             if text:
-                _write(beside, text, parameter_file)
-        if text:
-            os.replace(beside, parameter_file)
+                os.replace(beside, parameter_file)
+        finally:
+            beside.unlink(missing_ok=True)
         return Converted(dict(writer.counts), parameter_file if text else None,
                          list(reader.warnings), reader.damaged, reader.format)
 

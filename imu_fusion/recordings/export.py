@@ -13,6 +13,7 @@ import numpy as np
 from imu_fusion.errors import BagError
 from imu_fusion.geometry.rotation_arrays import rpy_angles
 from imu_fusion.messages.layouts import (
+    ACCEL,
     FIX,
     IMU,
     MAG,
@@ -23,7 +24,7 @@ from imu_fusion.messages.layouts import (
     Layout,
 )
 from imu_fusion.recordings.bag_reader import Reader, open_bag
-from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.recordings.targets import make_parents, refuse_source, remove_empty
 
 _BLOCK = 2000    # messages that are decoded at once
 _XYZ = ("x", "y", "z")
@@ -33,10 +34,10 @@ def _axes(name: str, unit: str) -> list[str]:
     return [f"{name}_{axis} [{unit}]" for axis in _XYZ]
 
 
-def _diagonal(values: np.ndarray, field: slice, size: int = 3) -> np.ndarray:
-    """Standard deviations (n, 3) of the first three axes of covariances; NaN where unknown."""
+def _diagonal(values: np.ndarray, field: slice, size: int = 3, first: int = 0) -> np.ndarray:
+    """Standard deviations (n, 3) of three axes of covariances from one on; NaN where unknown."""
     cov = values[:, field].reshape(len(values), size, size)
-    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2)[:, :3], 0.0))
+    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2)[:, first:first + 3], 0.0))
     return np.where(sd > 0.0, sd, np.nan)
 
 
@@ -63,6 +64,12 @@ def _odometry(values: np.ndarray) -> np.ndarray:
         values[:, ODOMETRY["linear"]], values[:, ODOMETRY["angular"]]])
 
 
+def _accel(values: np.ndarray) -> np.ndarray:
+    return np.column_stack([
+        values[:, ACCEL["linear"]], _diagonal(values, ACCEL["covariance"], 6),
+        values[:, ACCEL["angular"]], _diagonal(values, ACCEL["covariance"], 6, first=3)])
+
+
 Columns = tuple[Layout, list[str], Callable[[np.ndarray], np.ndarray]]
 _QUATERNION = ["q_x", "q_y", "q_z", "q_w"]
 _ANGLES = ["roll [deg]", "pitch [deg]", "yaw [deg]"]
@@ -80,11 +87,15 @@ _COLUMNS: tuple[Columns, ...] = (
         [v[:, POSE["position"]], v[:, POSE["orientation"]],
          np.degrees(rpy_angles(v[:, POSE["orientation"]]))])),
     (ODOMETRY, [*_axes("position", "m"), *_axes("sd_position", "m"), *_QUATERNION, *_ANGLES,
-                *_axes("velocity_body", "m/s"), *_axes("angular_velocity", "rad/s")], _odometry))
+                *_axes("velocity_body", "m/s"), *_axes("angular_velocity", "rad/s")], _odometry),
+    (ACCEL, [*_axes("acceleration", "m/s^2"), *_axes("sd_acceleration", "m/s^2"),
+             *_axes("angular_acceleration", "rad/s^2"),
+             *_axes("sd_angular_acceleration", "rad/s^2")], _accel))
 _TABLES = {columns[0].msgtype: columns for columns in _COLUMNS}
 
 
-def export(path: str | Path, out: str | Path, topics: Collection[str] = ()) -> dict[str, int]:
+def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
+           forms: Collection[str] = ()) -> dict[str, int]:
     """Write each topic that has numbers as a table.
 
     Args:
@@ -92,6 +103,7 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = ()) -> d
         out: folder to make: ``<topic>.csv``, a row for each message, with stamps in ns since 1970
             and in s since the first message of the recording; of poses also ``<topic>.tum`` (time,
             position, quaternion x y z w), of fixes ``<topic>.gpx``.
+        forms: those of csv, tum and gpx to write; all, if empty.
 
     Returns:
         dict of file name to number of rows.
@@ -104,25 +116,30 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = ()) -> d
     if out.exists():
         raise BagError(f"{out}: exists already; choose another folder")
     part = out.with_name(f".{out.name}.part-{os.getpid()}")
+    folders: list[Path] = []
     try:
-        part.mkdir(parents=True)
+        folders = make_parents(out)
+        part.mkdir()
         with open_bag(path) as reader:
             wanted = [reader.require(topic).name for topic in topics] or list(reader.topics)
             counts: dict[str, int] = {}
             for name in wanted:
                 if reader.topics[name].msgtype in _TABLES:
-                    counts |= _write(reader, name, part)
+                    counts |= _write(reader, name, part, forms)
         if not counts:
-            raise BagError(f"{path}: no topic that can be a table: {', '.join(sorted(_TABLES))}")
+            raise BagError(f"{path}: no topic that can be a table"
+                           + (f" of the form {' or '.join(forms)}" if forms else "")
+                           + f": {', '.join(sorted(_TABLES))}")
         os.rename(part, out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror})") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
+        remove_empty(folders)
     return counts
 
 
-def _write(reader: Reader, topic: str, folder: Path) -> dict[str, int]:
+def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> dict[str, int]:
     """{file: rows} of the files of one topic."""
     layout, names, values = _TABLES[reader.topics[topic].msgtype]
     stem = topic.strip("/").replace("/", "_")
@@ -131,6 +148,8 @@ def _write(reader: Reader, topic: str, folder: Path) -> dict[str, int]:
         suffixes[".tum"] = _Tum(layout)
     elif layout is FIX:
         suffixes[".gpx"] = _Gpx()
+    if forms:
+        suffixes = {suffix: form for suffix, form in suffixes.items() if suffix[1:] in forms}
     counts = {}
     with ExitStack() as stack:
         files = {suffix: stack.enter_context(open(folder / (stem + suffix), "w"))

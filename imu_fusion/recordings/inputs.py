@@ -5,14 +5,13 @@ from collections.abc import Mapping
 from imu_fusion.recordings.bag_reader import Reader
 
 
-def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[str, str],
-                remap: Mapping[str, str]) -> tuple[dict[str, str], str]:
+def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[str, str]
+                ) -> tuple[dict[str, str], str]:
     """Where a recording holds topics.
 
     Args:
         reader: an open recording.
         required, optional: topic to message type.
-        remap: topic names of ours to those in the recording.
 
     Returns:
         dict of our topic to its name in the recording, and words for required ones that it
@@ -23,7 +22,7 @@ def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[s
     """
     names = {}
     for topic, msgtype in {**required, **optional}.items():
-        name = reader.find(remap.get(topic, topic))
+        name = reader.find(topic)
         if name is not None and reader.topics[name].count:
             names[topic] = reader.require(name, msgtype).name
     missing = {topic: msgtype for topic, msgtype in required.items() if topic not in names}

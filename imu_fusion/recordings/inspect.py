@@ -1,7 +1,10 @@
 """What is in a recording, topic by topic: rates, gaps, ranges, and what looks wrong."""
 
+import math
+import re
 import struct
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,6 +22,9 @@ from imu_fusion.samples.turning import check_axes
 _HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 _LATEST = 2**63 - 1    # of log times, which MCAP counts to twice as far
 
+STRETCH = 200_000
+"""Messages that are looked at together where memory is to be bounded."""
+
 
 @dataclass(frozen=True)
 class Range:
@@ -34,19 +40,17 @@ class Range:
 class TopicReport:
     """One topic: ``stamp`` (n,) int64 ns of its headers (log times, if it is not ``stamped``
     because its messages have no header) and their ``timing``, ``ranges`` of what it measures,
-    ``findings`` about it, and its ``log`` if there is one for its type."""
+    ``findings`` about it, and its ``log`` if there is one for its type. Of several stretches there
+    are neither ``stamp`` nor ``log``."""
 
     topic: str
     msgtype: str
     stamp: np.ndarray = field(repr=False, compare=False)
+    timing: checks.Timing
     ranges: tuple[Range, ...] = ()
     findings: tuple[Finding, ...] = ()
     stamped: bool = True
     log: Log | None = field(default=None, repr=False, compare=False)
-    timing: checks.Timing = field(init=False)
-
-    def __post_init__(self):
-        object.__setattr__(self, "timing", checks.timing(self.stamp))
 
     @property
     def count(self) -> int:
@@ -72,11 +76,13 @@ class TopicReport:
         return [finding.text.removeprefix(self.topic + ": ") for finding in self.findings]
 
 
-def inspect_topics(reader: Reader) -> list[TopicReport]:
+def inspect_topics(reader: Reader, most: float = math.inf) -> list[TopicReport]:
     """Inspect every topic of an open recording.
 
     Args:
         reader: what :func:`imu_fusion.recordings.bag_reader.open_bag` returned.
+        most: messages that are held at once. A longer recording is looked at in such stretches, and
+            a finding says in how many of them it holds.
 
     Returns:
         list of TopicReport, in order of their names.
@@ -85,29 +91,89 @@ def inspect_topics(reader: Reader) -> list[TopicReport]:
         name: LogCollector(SAMPLE_TYPES[info.msgtype]) if info.msgtype in SAMPLE_TYPES
         else _Stamps(_begins_with_header(reader.definition(name)))
         for name, info in sorted(reader.topics.items())}
+    whole: dict[str, _Stretches] = {name: _Stretches() for name in collectors}
+    held = 0
     for topic, _, log_time, cdr in reader.messages():
+        if held >= most:
+            _conclude(reader, collectors, whole)
+            held = 0
+        held += 1
         collector = collectors[topic]
         if isinstance(collector, LogCollector):
             collector.add(cdr)
         else:
             collector.add(log_time, cdr)
+    _conclude(reader, collectors, whole)
+    return [_with_messages(whole[name].report(), collector, reader)
+            for name, collector in collectors.items()]
+
+
+def _conclude(reader: Reader, collectors: "Mapping[str, LogCollector | _Stamps]",
+              whole: "Mapping[str, _Stretches]") -> None:
+    """Look at what has been collected, and let it go."""
     reports = []
     for name, collector in collectors.items():
         msgtype = reader.topics[name].msgtype
-        if isinstance(collector, LogCollector):
-            report = inspect_log(name, msgtype, collector.log())
-            report = replace(report, findings=(
-                *checks.check_frames(collector.frame_ids, name), *report.findings))
-            if collector.refused:
-                text = undecodable(name, collector.refused)
-                reader.lose(text)
-                report = replace(report, findings=(Finding("type", text),
-                                                   *report.findings))
+        reports.append(inspect_log(name, msgtype, collector.log())
+                       if isinstance(collector, LogCollector) else collector.report(name, msgtype))
+    imus = [report.log for report in reports if isinstance(report.log, ImuLog) and report.count]
+    for report in reports:
+        whole[report.topic].add(_with_axes(report, imus))
+
+
+class _Stretches:
+    """What is found in one stretch after the other of a topic."""
+
+    def __init__(self) -> None:
+        self._report: TopicReport | None = None
+        self._count, self._last = 0, np.empty(0, np.int64)
+        # Words without their numbers: the Finding, in how many stretches, from what stamp on.
+        self._found: dict[tuple[str, str], tuple[Finding, int, int]] = {}
+
+    def add(self, report: TopicReport) -> None:
+        """The next stretch."""
+        if self._report is not None and not report.count:
+            return
+        for finding in report.findings:
+            key = finding.kind, re.sub(r"[-+0-9.e]+", "", finding.text)
+            first, times, stamp = self._found.get(key, (finding, 0, report.timing.first))
+            self._found[key] = first, times + 1, stamp
+        if self._report is None or not self._report.count:
+            self._report = report
         else:
-            report = collector.report(name, msgtype)
-        reports.append(report)
-    imus = [report.log for report in reports if isinstance(report.log, ImuLog)]
-    return [_with_axes(report, imus) for report in reports]
+            timing = checks.timing(np.concatenate([self._last, report.stamp]))
+            ranges = {r.quantity: r for r in self._report.ranges}
+            for r in report.ranges:
+                known = ranges.get(r.quantity, r)
+                ranges[r.quantity] = replace(r, low=min(r.low, known.low),
+                                             high=max(r.high, known.high))
+            self._report = replace(
+                report, stamp=report.stamp[:0], log=None, ranges=tuple(ranges.values()),
+                timing=self._report.timing.followed_by(timing))
+        self._count += 1
+        self._last = report.stamp[-1:].copy()
+
+    def report(self) -> TopicReport:
+        """Of all of them."""
+        assert self._report is not None
+        return replace(self._report, findings=tuple(
+            finding if times == self._count else replace(
+                finding, text=f"{finding.text} (in {times} of {self._count} stretches of the "
+                f"recording, the first of them from stamp {stamp} on)")
+            for finding, times, stamp in self._found.values()))
+
+
+def _with_messages(report: TopicReport, collector: "LogCollector | _Stamps", reader: Reader
+                   ) -> TopicReport:
+    """Add what is wrong with the messages, not with the samples in them."""
+    if not isinstance(collector, LogCollector):
+        return report
+    findings = [*checks.check_frames(collector.frame_ids, report.topic), *report.findings]
+    if collector.refused:
+        text = undecodable(report.topic, collector.refused)
+        reader.lose(text)
+        findings.insert(0, Finding("type", text))
+    return replace(report, findings=tuple(findings))
 
 
 def inspect_log(name: str, msgtype: str, log: Log) -> TopicReport:
@@ -133,7 +199,7 @@ def inspect_log(name: str, msgtype: str, log: Log) -> TopicReport:
         findings = checks.check_stamps(log.stamp, name)
         if isinstance(log, PoseLog):
             findings += checks.check_finite(log.quat_world_imu, name, "orientation")
-    return TopicReport(name, msgtype, log.stamp,
+    return TopicReport(name, msgtype, log.stamp, checks.timing(log.stamp),
                        tuple(r for r in ranges if r is not None), tuple(findings), log=log)
 
 
@@ -159,11 +225,12 @@ class _Stamps:
         self._times.append(min(log_time, _LATEST))
 
     def report(self, name: str, msgtype: str) -> TopicReport:
-        stamps = np.array(self._times, dtype=np.int64)
+        stamps, self._times = np.array(self._times, dtype=np.int64), array("q")
         # Messages without a header, or about changes, are sent at any time: gaps mean nothing.
         findings = [finding for finding in checks.check_stamps(stamps, name)
                     if self._stamped and (finding.kind != "gap" or msgtype != FLAGS_TYPE)]
-        return TopicReport(name, msgtype, stamps, (), tuple(findings), self._stamped)
+        return TopicReport(name, msgtype, stamps, checks.timing(stamps), (), tuple(findings),
+                           self._stamped)
 
 
 def _begins_with_header(definition):

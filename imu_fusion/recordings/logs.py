@@ -3,11 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
 from imu_fusion.errors import TopicError
 from imu_fusion.messages.convert import SAMPLE_TYPES, SampleType
 from imu_fusion.recordings.bag_reader import Reader
+from imu_fusion.samples.blocks import Growing
 from imu_fusion.samples.logs import Log
 
 _BLOCK = 2000    # messages that are decoded at once
@@ -23,8 +22,7 @@ class LogCollector:
     def __init__(self, kind: SampleType) -> None:
         self._kind = kind
         self._waiting: list[bytes] = []
-        self._stamps = [np.empty(0, np.int64)]
-        self._values = [np.empty((0, kind.width))]
+        self._samples = Growing(kind.width)
         self.frame_ids: dict[str, None] = {}
         self.refused: dict[str, int] = {}
 
@@ -35,10 +33,9 @@ class LogCollector:
             self._decode()
 
     def log(self) -> Log:
-        """The log of all messages that could be decoded."""
+        """The log of the messages that could be decoded, of those since it was last asked for."""
         self._decode()
-        return self._kind.log(np.concatenate(self._stamps), np.concatenate(self._values),
-                              next(iter(self.frame_ids), ""))
+        return self._kind.log(*self._samples.take(), next(iter(self.frame_ids), ""))
 
     def _decode(self) -> None:
         block = self._kind.layout.decode_block(self._waiting)
@@ -46,8 +43,7 @@ class LogCollector:
         for reason in block.refused.values():
             self.refused[reason] = self.refused.get(reason, 0) + 1
         if len(block.stamp):
-            self._stamps.append(block.stamp)
-            self._values.append(self._kind.values(block.values))
+            self._samples.add(block.stamp, self._kind.values(block.values))
             self.frame_ids |= dict.fromkeys(block.frame_ids)
 
 

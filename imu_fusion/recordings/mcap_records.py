@@ -20,6 +20,7 @@ _LENGTHS = {1: (8, 1 << 20), 2: (20, 20), 3: (14, 1 << 26), 4: (16, 1 << 26), 5:
             6: (40, 1 << 62), 7: (6, 1 << 40), 8: (64, 1 << 30), 9: (36, 1 << 62),
             10: (44, 1 << 30), 11: (42, 1 << 30), 12: (8, 1 << 30), 13: (20, 1 << 30),
             14: (17, 17), 15: (4, 4)}
+_IN_CHUNK = (SCHEMA, CHANNEL, MESSAGE)
 HEAD = struct.Struct("<BQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -129,12 +130,13 @@ def _is_record(file: Window, position: int) -> bool:
 
 
 def records(data: bytes) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of the records of a chunk, as far as their lengths fit."""
+    """(opcode, content) of the records of a chunk, as far as they are what may be in one: a chunk
+    of zeros is no million of records."""
     view, position = memoryview(data), 0
     while position + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, position)
         position += HEAD.size
-        if length > len(data) - position:
+        if opcode not in _IN_CHUNK or not _LENGTHS[opcode][0] <= length <= len(data) - position:
             return
         yield opcode, view[position:position + length]
         position += length

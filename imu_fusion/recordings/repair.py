@@ -1,6 +1,6 @@
 """A clean copy of a damaged recording."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from imu_fusion.recordings.bag_reader import Reader, open_bag
@@ -21,27 +21,25 @@ def repair(path: str | Path, directory: str | Path) -> dict[str, int]:
 
 
 def copy(reader: Reader, writer: BagWriter, topics: Collection[str] | None = None,
-         renamed: Mapping[str, str] | None = None,
          messages: Iterable[tuple[str, str, int, bytes]] | None = None) -> None:
     """Copy the messages of a recording, with their types and QoS.
 
     Args:
-        topics: names in the recording; None for all. renamed: some of them to new names.
+        topics: those to copy; None for all.
         messages: those of ``reader``, if somebody looks on.
 
     Topics whose type nobody defines cannot be written; ``reader.warnings`` says so.
     """
     names = list(reader.topics) if topics is None else topics
-    kept = {}
+    kept = set()
     for name in names:
         if reader.definition(name) is None:
             reader.lose(f"topic {name} is not copied: the definition of its type "
                         f"{reader.topics[name].msgtype} is not in the recording")
         else:
-            kept[name] = (renamed or {}).get(name, name)
+            kept.add(name)
     for topic, msgtype, log_time, cdr in reader.messages(kept) if messages is None else messages:
         if topic in kept:
-            target = kept[topic] if kept[topic].startswith("/") else f"/{kept[topic]}"
-            writer.write(target, msgtype, cdr, log_time,
+            writer.write("/" + topic.lstrip("/"), msgtype, cdr, log_time,
                          qos=reader.topics[topic].qos_profiles or None,
                          definition=reader.definition(topic))

@@ -356,7 +356,7 @@ def _records(data: bytes) -> Iterator[tuple[dict[str, bytes], memoryview]]:
         fields = _fields(bytes(view[position + 4:start]))
         (size,) = struct.unpack_from("<I", data, start)
         position = start + 4 + size
-        if fields is None or position > len(data):
+        if not fields or position > len(data):    # none: zeros, by the million
             raise DamageError("a record in it is damaged")
         yield fields, view[start + 4:position]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imu_fusion.errors import BagError, ImuFusionError
-from imu_fusion.messages.samples import msgtype_of, sample_messages
+from imu_fusion.messages.samples import fits_message, msgtype_of, sample_messages
 from imu_fusion.recordings.qos import qos_profile
 from imu_fusion.recordings.storage import Row, Storage, StoredTopic
 from imu_fusion.samples.logs import Log
@@ -27,20 +27,29 @@ def format_of(path: Path) -> Format | None:
 
 
 def read_source(path: Path, source: Source) -> list[Block]:
-    """All samples of a file, folder or archive.
+    """All samples of a file, folder or archive that messages can hold.
 
     Raises:
         ImuFusionError: names the file, and the line or part that is wrong.
     """
     try:
         blocks = [block for part, data in parts(path) for block in source.feed(data, part)]
-        return blocks + source.finish()
+        return [in_range(block, source) for block in blocks + source.finish()]
     except ImuFusionError:
         raise
     except (MemoryError, RecursionError, ArithmeticError, LookupError, ValueError, TypeError,
             AttributeError) as error:
         raise BagError(f"{path}: damaged beyond reading ({type(error).__name__}: {error})"
                        ) from error
+
+
+def in_range(block: Block, source: Source) -> Block:
+    """Without the samples whose stamps no message can hold, which are counted as lost."""
+    fits = fits_message(block.log.stamp)
+    if fits.all():
+        return block
+    source.lost["samples stamped before 1970 or after 2038"] += int((~fits).sum())
+    return block._replace(log=block.log[fits])
 
 
 class SourceStorage(Storage):
@@ -58,7 +67,8 @@ class SourceStorage(Storage):
                   TableSource(Description.from_mapping(description, described_in)))
         found: dict[str, list[Log]] = {}
         for topic, log, _ in read_source(path, source):
-            found.setdefault("/" + topic, []).append(log)
+            if len(log):
+                found.setdefault("/" + topic, []).append(log)
         for what, count in source.lost.items():
             lose(f"{path.name}: {count} {what}")
         for remark in source.remarks:

@@ -20,7 +20,8 @@ _GIVE_UP = 2000          # rows in a row that cannot be read: the rest of the fi
 
 
 class SqliteStorage(Storage):
-    """See :class:`imu_fusion.recordings.storage.Storage`."""
+    """See :class:`imu_fusion.recordings.storage.Storage`. Log times below zero, which nothing else
+    can hold, are zero."""
 
     def __init__(self, path: Path, lose: Callable[[str], object],
                  mention: Callable[[str], object]) -> None:
@@ -44,7 +45,7 @@ class SqliteStorage(Storage):
     def messages(self, topics: Collection[str], start: int | None,
                  stop: int | None) -> Iterator[Row]:
         wanted = {number: name for number, name in self._numbers.items() if name in topics}
-        low = -_LARGEST_STAMP if start is None else start
+        low = start or -_LARGEST_STAMP
         high = _LARGEST_STAMP if stop is None else stop - 1
         where = (f"topic_id in ({', '.join('?' * len(wanted))}) and timestamp >= ? "
                  "and timestamp <= ?")
@@ -56,7 +57,7 @@ class SqliteStorage(Storage):
                     "order by timestamp, id", values):
                 done = (stamp, row)
                 if isinstance(data, bytes) and isinstance(stamp, int):
-                    yield stamp, wanted[number], data
+                    yield max(stamp, 0), wanted[number], data
         except (sqlite3.Error, OverflowError, MemoryError) as error:
             self.lose(f"{self.path.name}: damaged after {span(done[0] or None, None)} ({error}); "
                       "the rest is fetched row by row")
@@ -100,7 +101,10 @@ class SqliteStorage(Storage):
             first, last = self._database.execute(
                 "select min(timestamp), max(timestamp) from messages").fetchone()
             if isinstance(first, int) and isinstance(last, int):
-                self.times = first, last
+                self.times = max(first, 0), max(last, 0)
+                if first < 0:
+                    self.mention(f"{self.path.name}: log times go down to {first} ns; those below "
+                                 "zero are read as zero")
         except sqlite3.Error as error:
             self.lose(f"{self.path.name}: damaged ({error}); what can be read is read row by row")
             stamps = []
@@ -109,7 +113,7 @@ class SqliteStorage(Storage):
                     self.topics[self._numbers[number]].count += 1
                     stamps.append(stamp)
             if stamps:
-                self.times = min(stamps), max(stamps)
+                self.times = max(min(stamps), 0), max(0, *stamps)
 
     def _rows_left(self) -> Iterator[tuple[int, int, int]]:
         """(row, topic, log time) of all rows that can be reached, in order of the rows."""
@@ -154,7 +158,7 @@ class SqliteStorage(Storage):
             except (sqlite3.Error, OverflowError, MemoryError):
                 data = None
             if data is not None and isinstance(data[0], bytes):
-                yield stamp, wanted[number], data[0]
+                yield max(stamp, 0), wanted[number], data[0]
             else:
                 missing.append(stamp)
         if missing:

@@ -131,7 +131,8 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
     """
     if size > largest_chunk():
         raise DamageError(f"it would unpack to {size / 1e6:.0f} MB, more than the bound of "
-                          f"{largest_chunk() / 1e6:.0f} MB: set {LIMIT_VARIABLE} if that is right")
+                          f"{largest_chunk() / 1e6:.0f} MB: raise it by --max-chunk-mb, or by "
+                          f"{LIMIT_VARIABLE} in the environment, if that is right")
     try:
         if compression == "zstd":
             with zstandard.ZstdDecompressor().stream_reader(data) as stream:

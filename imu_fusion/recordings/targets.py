@@ -1,5 +1,6 @@
 """Where a recording may be written: not over what it is made of, nor over other files."""
 
+import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -12,7 +13,8 @@ METADATA_FILE = "metadata.yaml"
 LIBRARY = "imu_fusion"    # what the header of our MCAP files names
 
 # What we write into the directory of a recording beside its files.
-_BESIDE = (METADATA_FILE, RESULTS_FILE, "report.html")
+_REPORT = "report.html"
+_BESIDE = (METADATA_FILE, RESULTS_FILE, _REPORT)
 _HEADER = 256             # bytes of an MCAP file in which its header names the library
 DATA_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
@@ -47,16 +49,32 @@ def refuse_files(sources: Iterable[str | Path | None], out: str | Path) -> None:
 
 
 def _identities(path: Path) -> Iterator[tuple[int, int]]:
-    """Device and inode of a file, or of the files below a directory."""
+    """Device and inode of a file, or of the files below a directory, but for reports: nobody reads
+    these."""
     if path.is_dir():
         for folder, _, names in os.walk(path):
-            yield from (found for name in names for found in _identities(Path(folder) / name))
+            yield from (found for name in names if name != _REPORT
+                        for found in _identities(Path(folder) / name))
     else:
         try:
             status = path.stat()
         except OSError:    # a link that leads nowhere
             return
         yield status.st_dev, status.st_ino
+
+
+def make_parents(target: Path) -> list[Path]:
+    """Make the folders that a target shall stand in; those made, innermost first."""
+    missing = [folder for folder in target.parents if not folder.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those of the folders that hold nothing, innermost first."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def why_not_replaced(directory: Path) -> str:

@@ -9,15 +9,18 @@ import numpy as np
 
 from imu_fusion.batch import estimate
 from imu_fusion.errors import TopicError
+from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.messages.convert import attitude_log, bool_value
 from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
 from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.inspect import TopicReport, inspect_topics
 from imu_fusion.report.orientation_status import Status
 from imu_fusion.report.smoother import Smoothed
+from imu_fusion.report.trajectory_data import read_result
 from imu_fusion.samples import AttitudeLog
-from imu_fusion.samples.guard import guard_log
+from imu_fusion.samples.guard import usable_part
 from imu_fusion.samples.logs import Log
 from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
 from imu_fusion.streams.stage import StageReport
@@ -59,13 +62,13 @@ class Contents:
         return self.logs.get(topic) if topic else None
 
 
-def read_contents(path: str | Path) -> Contents:
-    """Read a recording for a report.
+def read_contents(path: str | Path, remap: Mapping[str, str] | None = None) -> Contents:
+    """Read a recording for a report. remap: topic names of ours to those in it.
 
     Raises:
         BagError, TopicError: it cannot be read, or holds no messages.
     """
-    with open_bag(path) as reader:
+    with open_bag(path, remap=remap) as reader:
         topics = inspect_topics(reader)
         if not any(t.count for t in topics):
             raise TopicError(f"{path}: no messages to report about")
@@ -93,24 +96,41 @@ class Estimates:
     warnings: list[str]
 
 
-def read_estimates(path: str | Path) -> Estimates:
-    """The Estimates in a recording."""
-    with open_bag(path) as reader:
-        return _estimates({name: [cdr for *_, cdr in reader.messages([reader.require(name).name])]
-                           for name, msgtype in _ESTIMATES.items() if _has(reader, name, msgtype)})
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What a recording holds of estimates: of the orientation; of the smoother, or else why there
+    is none; its ``remarks``, and those of others beside the recording; names of its ``topics``."""
+
+    orientation: Estimates
+    trajectory: SmootherResult | None
+    obstacle: str
+    remarks: list[str]
+    topics: list[str]
 
 
-def make_estimates(bag: str | Path, params_file: str | Path | None, with_orientation: bool
-                   ) -> tuple[Estimates, StageReport]:
+def read_recorded(path: str | Path, remap: Mapping[str, str] | None = None) -> Recorded:
+    """The estimates in a recording; remap: topic names of ours to those in it."""
+    with open_bag(path, remap=remap) as reader:
+        orientation = _estimates({
+            name: [cdr for *_, cdr in reader.messages([reader.require(name).name])]
+            for name, msgtype in _ESTIMATES.items() if _has(reader, name, msgtype)})
+        trajectory, remarks, obstacle = read_result(reader)
+        return Recorded(orientation, trajectory, obstacle,
+                        [f"{SMOOTHER}: {remark}" for remark in remarks], list(reader.topics))
+
+
+def make_estimates(bag: str | Path, params_file: ParamsFile, with_orientation: bool,
+                   remap: Mapping[str, str] | None = None) -> tuple[Estimates, StageReport]:
     """What ``process`` would say of a recording: Estimates, and the smoother's StageReport.
 
     Args:
         bag: recording.
-        params_file: ROS 2 parameter file, or None for defaults.
+        params_file: ParamsFile; None: defaults.
         with_orientation: whether the orientation is estimated, too.
+        remap: topic names of ours to those in the recording.
     """
     nodes = [SMOOTHER, *([ORIENTATION] if with_orientation else [])]
-    reports, made = estimate(bag, nodes, params_file, keep=_ESTIMATES)
+    reports, made = estimate(bag, nodes, params_file, _ESTIMATES, remap)
     found = _estimates({topic: cdrs for topic, cdrs in made.items() if cdrs})
     return replace(found, warnings=[
         *(text for node in nodes for text in (*reports[node].warnings, *reports[node].remarks)),
@@ -118,14 +138,13 @@ def make_estimates(bag: str | Path, params_file: str | Path | None, with_orienta
 
 
 def smoothed_of(report: StageReport, origin: int) -> tuple[Smoothed | None, str | None]:
-    """(Smoothed, None) of the smoother's report, (None, why not in words) where smoothing failed,
-    (None, None) where there was nothing to smooth.
+    """(Smoothed, None) of the smoother's report, or (None, why not in words).
 
     Args:
         report: of the smoother. origin: int ns, zero of the time axes.
     """
     if report.detail is None:
-        return None, f"There is no smoothed trajectory: {report.skipped}" if report.used else None
+        return None, report.skipped
     result, logs = report.detail
     (params,) = report.params
     surface = load_surface(params.surface.file) if params.surface.file else None
@@ -160,12 +179,8 @@ def _usable(log, name, warnings):
         if absent.any():
             warnings.append(f"{name}: {absent.sum()} orientations are zero and left out")
             log = log[~absent]
-    log, epochs, guard = guard_log(log)
-    for reason, count in guard.refused().items():
-        warnings.append(f"{name}: {count} samples left out: {reason}")
-    if len(epochs) and epochs[-1] > 0:
-        warnings.append(f"{name}: the clock was set back; only what comes before is shown")
-        log = log[epochs == 0]
+    log, texts = usable_part(log, name)
+    warnings += texts
     return log
 
 

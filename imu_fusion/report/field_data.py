@@ -1,5 +1,6 @@
 """What the report needs of an acceleration field: estimates and readings, read from recordings."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from imu_fusion.estimation.acceleration_field.rows import ROW, SATURATED, field_
 from imu_fusion.estimation.acceleration_field.sensor_array import AccelerometerParams
 from imu_fusion.messages.convert import attitude_log
 from imu_fusion.messages.layouts import ACCEL, IMU
+from imu_fusion.parameters.file import ParamsFile, files_of
 from imu_fusion.recordings.bag_reader import find_topic, open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.results import read_results
@@ -82,14 +84,16 @@ class FieldData:
 
 
 def read_field(bag: str | Path, estimates: str | Path,
-               params_file: str | Path | None = None) -> FieldData | None:
+               params_file: ParamsFile = None,
+               remap: Mapping[str, str] | None = None) -> FieldData | None:
     """FieldData of a recording and of the one with its estimates; None if it holds none.
 
     Args:
         bag: recording with the accelerometers.
         estimates: recording with acceleration_field/imu and acceleration_field/accel.
-        params_file: parameter file of the estimator, or None: then nothing is known of the
+        params_file: ParamsFile of the estimator; None: then nothing is known of the
             accelerometers.
+        remap: topic names of ours to those in ``bag``.
     """
     with open_bag(estimates) as reader:
         if any(find_topic(reader.topics, t) is None for t in (IMU_TOPIC, ACCEL_TOPIC)):
@@ -102,7 +106,7 @@ def read_field(bag: str | Path, estimates: str | Path,
         return None
     rows = _rows(shared, imu[i], covs[i], values[j])
     config = read_configuration(params_file)
-    readings, gyr = _measured(bag, config, rows["stamp"])
+    readings, gyr = _measured(bag, config, rows["stamp"], remap)
     for name, reading in readings.items():
         limit = config.accelerometers[name].completed(config.field.sensor).range
         if limit is not None:
@@ -110,7 +114,7 @@ def read_field(bag: str | Path, estimates: str | Path,
                 rows["flags"][(np.abs(reading) >= limit).any(axis=1)] |= SATURATED
     found = read_results(estimates)
     beside = {} if found is None else found.get(NODE, {})
-    if found is None and params_file is not None:
+    if found is None and files_of(params_file):
         impacts = measure_impacts(rows, config.field.points, config.field.gravity,
                                   config.stream.impact)
     else:
@@ -146,11 +150,11 @@ def _rows(stamps, imu, covs, accel):
     return rows
 
 
-def _measured(bag, config, stamps):
+def _measured(bag, config, stamps, remap):
     """Readings of the accelerometers and the gyroscope at the stamps of the estimates."""
     readings, gyr = {}, None
     tolerance = int(round(config.stream.match.tolerance * 1e9))
-    with open_bag(bag) as reader:
+    with open_bag(bag, remap=remap) as reader:
         for name in config.accelerometers:
             topic = f"accelerometers/{name}"
             if find_topic(reader.topics, topic) is not None:

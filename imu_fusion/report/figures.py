@@ -116,6 +116,7 @@ def time_figure(panels: Sequence[Panel], shades: Sequence[Shade] = (), panel_hei
                     y=1 + 12 / (panel_height * len(panels) - 5), font=dict(size=13),
                     itemsizing="constant"))
     figure.update_xaxes(zeroline=False, hoverformat=".3f", matches="x")
+    figure.layout.xaxis.matches = None    # the one that the others match
     figure.update_yaxes(nticks=6)
     figure.update_xaxes(title=dict(text="time since start in s", font=dict(size=13), standoff=6),
                         row=len(panels), col=1)

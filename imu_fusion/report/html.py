@@ -9,6 +9,7 @@ import base64
 import html
 import json
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -16,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import plotly.graph_objects
-import plotly.offline
 
 import imu_fusion
 from imu_fusion.errors import ImuFusionError
@@ -85,8 +85,9 @@ class Table:
         head = "".join(self._cell("th", *pair) for pair in zip(self.header, numeric))
         body = "".join("<tr>" + "".join(self._cell("td", *pair) for pair in zip(row, numeric))
                        + "</tr>" for row in self.rows)
-        caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
-        return (f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead>'
+        # Not <caption>: that is as wide as the table, of which a phone shows a part.
+        caption = f'<p class="caption">{html.escape(self.caption)}</p>' if self.caption else ""
+        return (f'{caption}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
                 f"<tbody>{body}</tbody></table></div>")
 
     @staticmethod
@@ -104,7 +105,9 @@ class Figure:
     linked: bool = True
 
     def render(self) -> str:
-        data = json.dumps(self.figure.to_plotly_json(), default=_binary)
+        arrays: dict[bytes, int] = {}
+        parts = _without_arrays(self.figure.to_plotly_json(), arrays)
+        data = json.dumps(parts | {"arrays": [_packed(planes) for planes in arrays]})
         # Inside <script> only "<" could end the element or open a comment.
         data = data.replace("<", "\\u003c")
         caption = f"<figcaption>{html.escape(self.caption)}</figcaption>" if self.caption else ""
@@ -114,10 +117,27 @@ class Figure:
                 f'<script type="application/json">{data}</script>{caption}</figure>')
 
 
-def _binary(value):
-    """Arrays as new versions of plotly write them, a third of their size as text."""
-    array = np.ascontiguousarray(value, dtype="<f4")
-    return {"dtype": "f4", "bdata": base64.b64encode(array.tobytes()).decode()}
+def _without_arrays(value, arrays):
+    """JSON of plotly with {"array": k} for its arrays, which go to ``arrays``: bytes to k.
+
+    Equal ones are kept once, as float32, all first bytes ahead of all second ones: neighbours have
+    these in common, so that they pack well.
+    """
+    if isinstance(value, dict) and "bdata" in value:    # plotly 6 and later
+        value = np.frombuffer(base64.b64decode(value["bdata"]), value["dtype"])
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        array = np.ascontiguousarray(value, dtype="<f4").reshape(-1)
+        planes = array.view("u1").reshape(-1, 4).T.tobytes()
+        return {"array": arrays.setdefault(planes, len(arrays))}
+    if isinstance(value, dict):
+        return {key: _without_arrays(part, arrays) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_arrays(part, arrays) for part in value]
+    return value
+
+
+def _packed(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data, 9)).decode()
 
 
 Block = Text | Notes | Numbers | Table | Figure
@@ -129,6 +149,17 @@ class Section:
 
     title: str
     blocks: tuple[Block, ...]
+
+
+def scripts() -> str:
+    """What draws the figures of a page: plotly with figures in the plane and in space, packed, and
+    what unpacks it."""
+    return (f'<script type="text/plain" id="plotly">{_packed(_own("plotly-gl3d.min.js").encode())}'
+            f'</script>\n<script>{_own("report.js")}</script>')
+
+
+def _own(name):
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
 def write_report(path: str | Path, title: str, sections: Sequence[Section], subtitle: str = ""
@@ -161,10 +192,7 @@ def render_report(title: str, sections: Sequence[Section], subtitle: str = "") -
         f'<section id="{anchor}"><h2>{html.escape(section.title)}</h2>'
         + "".join(block.render() for block in section.blocks) + "</section>"
         for anchor, section in zip(anchors, sections))
-    style, script = (files(__package__).joinpath(name).read_text(encoding="utf-8")
-                     for name in ("report.css", "report.js"))
-    config = json.dumps({"responsive": True, "displaylogo": False,
-                         "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"]})
+    style = _own("report.css")
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -182,9 +210,7 @@ def render_report(title: str, sections: Sequence[Section], subtitle: str = "") -
 <footer>Written by imu_fusion {imu_fusion.__version__}. The figures show the greatest and least
 value of every stretch of a long signal; drag to zoom, double-click to go back: the time axes
 move together.</footer>
-<script>{plotly.offline.get_plotlyjs()}</script>
-<script>const plotConfig = {config};
-{script}</script>
+{scripts()}
 </body>
 </html>
 """

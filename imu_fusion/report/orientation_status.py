@@ -19,7 +19,7 @@ _SHADES = (
     ("magnetic disturbance", st.FLAG_MAG_DISTURBED, "#E69F00"),
     ("sensor at its limit", st.FLAG_SATURATED | st.FLAG_MAG_SATURATED, "#D55E00"),
     ("samples missing", st.FLAG_GAP, "#1f2933"),
-    ("a wild rate held", st.FLAG_HELD, "#56B4E9"),
+    ("a wild sample held", st.FLAG_HELD, "#56B4E9"),
     ("heading unknown", st.FLAG_NO_HEADING, "#CC79A7"),
 )
 

@@ -1,6 +1,7 @@
 """The report of a recording: what it holds, and how good what is made from it is."""
 
 import datetime
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,9 +15,10 @@ from imu_fusion.evaluation.orientation_error import (
     moving_at,
     orientation_errors,
 )
+from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.report.acceleration_field import field_sections
+from imu_fusion.report.avalanche import slope_of, slope_section
 from imu_fusion.report.contents import (
-    ESTIMATES,
     FIX_TOPIC,
     MAGNETOMETER,
     RAW,
@@ -25,7 +27,7 @@ from imu_fusion.report.contents import (
     Contents,
     make_estimates,
     read_contents,
-    read_estimates,
+    read_recorded,
     smoothed_of,
 )
 from imu_fusion.report.field_data import FieldData, read_field
@@ -43,23 +45,27 @@ from imu_fusion.report.orientation_status import Status, bias_section
 from imu_fusion.report.orientation_status import shades as status_shades
 from imu_fusion.report.overview import overview_section
 from imu_fusion.report.smoother import Smoothed, smoother_numbers, smoother_sections
+from imu_fusion.report.trajectory_data import smoothing_params
 from imu_fusion.samples import AttitudeLog, MagLog, seconds
+from imu_fusion.surfaces.file import load_surface
 
 
 class Written(NamedTuple):
-    """What a report was made of: ``smoothed`` None if there is nothing to smooth; ``complete``:
-    nothing of the recording was lost."""
+    """What a report was made of: ``smoothed`` None if there is no trajectory; ``complete``:
+    nothing of the recording was lost; its ``sections``."""
 
     smoothed: Smoothed | None
     complete: bool
+    sections: list[Section]
 
 
 @dataclass(frozen=True, eq=False)
 class _Material:
     """All that the sections tell of; None where there is no such thing.
 
-    ``source``: where the orientation comes from, in words; ``obstacle``: why there is no
-    trajectory; ``warnings``: of the recordings and the smoother.
+    ``source``: where the estimates come from, in words; ``obstacle``: why there is no
+    trajectory; ``held``: topics of the recording with the estimates; ``warnings``: of the
+    recordings and the smoother.
     """
 
     contents: Contents
@@ -68,6 +74,7 @@ class _Material:
     status: Status
     smoothed: Smoothed | None
     obstacle: str | None
+    held: list[str]
     field: FieldData | None
     warnings: list[str]
 
@@ -127,17 +134,19 @@ class _Material:
 
 
 def write_recording_report(bag: str | Path, estimates: str | Path | None, path: str | Path,
-                           params_file: str | Path | None = None) -> Written:
-    """Write the HTML report of a recording; its trajectory is what ``process`` would make of it.
+                           params_file: ParamsFile = None,
+                           remap: Mapping[str, str] | None = None) -> Written:
+    """Write the HTML report of a recording.
 
     Args:
         bag: recording with sensor topics and perhaps ``reference/pose``; another PoseStamped
             topic is used in its place if there is no such topic.
-        estimates: recording with ``imu/data``, may be the same; if it has none, the report says
-            so. None: those in ``bag``, or else made from it. ``acceleration_field/*`` in it
-            get their sections, too.
+        estimates: recording with what the estimators have written, may be the same; the report
+            says what it lacks. None: those in ``bag``, and what it lacks of orientation and
+            trajectory as ``process`` would make it.
         path: HTML file to write.
-        params_file: ROS 2 parameter file of the estimators, or None for defaults.
+        params_file: ParamsFile of the estimators; None: defaults.
+        remap: topic names of ours to those in ``bag``.
 
     Returns:
         Written.
@@ -146,30 +155,40 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
         BagError, TopicError: a recording cannot be read, or holds nothing to report about.
         ImuFusionError: parameters are not usable, or the file cannot be written.
     """
-    material = _gather(bag, estimates, params_file)
+    material = _gather(bag, estimates, params_file, remap)
     contents = material.contents
     sections = [_summary(material), overview_section(contents.topics, material.origin),
                 *_estimates(material), *_measurements(material)]
     date = datetime.datetime.fromtimestamp(contents.start * 1e-9, datetime.UTC)
     write_report(path, Path(bag).resolve().name, sections,
                  f"{bag}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
-    return Written(material.smoothed, not contents.damaged)
+    return Written(material.smoothed, not contents.damaged, sections)
 
 
-def _gather(bag, estimates, params_file) -> _Material:
-    contents = read_contents(bag)
+def _gather(bag, estimates, params_file, remap) -> _Material:
+    contents = read_contents(bag, remap)
     source = bag if estimates is None else estimates
-    recorded = read_estimates(source)
-    own = recorded.log is None and estimates is None
-    made, smoother = make_estimates(bag, params_file, with_orientation=own)
-    drawn = made if own else recorded
+    recorded = read_recorded(source, remap if estimates is None else None)
+    drawn, smoothed = recorded.orientation, None
+    obstacle: str | None = recorded.obstacle
+    warnings = [*contents.warnings, *drawn.warnings, *recorded.remarks]
     raw = contents.log(RAW)
-    smoothed, obstacle = smoothed_of(
-        smoother, int(raw.stamp[0]) if raw is not None and len(raw) else contents.start)
-    warnings = [*contents.warnings, *recorded.warnings, *made.warnings]
+    origin = int(raw.stamp[0]) if raw is not None and len(raw) else contents.start
+    own = drawn.log is None and estimates is None
+    if recorded.trajectory is not None:
+        params = smoothing_params(params_file)
+        surface = load_surface(params.surface.file) if params.surface.file else None
+        smoothed = Smoothed(recorded.trajectory, params, surface, contents.log(FIX_TOPIC),
+                            contents.log(VELOCITY_TOPIC), origin)
+    if estimates is None and (own or smoothed is None):
+        made, smoother = make_estimates(bag, params_file, own, remap)
+        drawn = made if own else drawn
+        warnings += made.warnings
+        if smoothed is None:
+            smoothed, obstacle = smoothed_of(smoother, origin)
     return _Material(contents, "this report's own run" if own else str(source), drawn.log,
-                     drawn.status, smoothed, obstacle, read_field(bag, source, params_file),
-                     list(dict.fromkeys(warnings)))
+                     drawn.status, smoothed, obstacle, recorded.topics,
+                     read_field(bag, source, params_file, remap), list(dict.fromkeys(warnings)))
 
 
 def _summary(material) -> Section:
@@ -186,16 +205,17 @@ def _summary(material) -> Section:
     blocks: list[Block] = [numbers]
     if m.warnings:
         blocks.append(Notes(tuple(m.warnings)))
-    if m.estimate is None and m.field is None:
-        blocks.append(Text(f"{Path(m.source).name} holds no estimates on {ESTIMATES}: this "
-                           "report is about the recording alone. imu_fusion process makes them."))
+    if m.estimate is None and m.field is None and m.smoothed is None:
+        held = ", ".join(sorted(m.held)) or "nothing"
+        blocks.append(Text(f"{Path(m.source).name} holds no estimates, but {held}: this report is "
+                           "about the recording alone. imu_fusion process makes them."))
     elif m.errors is not None:
         blocks.append(Text(f"Orientation from {m.source} against {contents.reference_name} of "
                            "the recording" + ("." if m.is_truth else ", which is somebody's "
                                               "estimate too: what follows are differences, not "
                                               "errors.")))
-    if m.obstacle is not None:
-        blocks.append(Text(m.obstacle))
+    if m.smoothed is None:
+        blocks.append(Text(f"There is no smoothed trajectory: {m.obstacle}."))
     return Section("Summary", tuple(blocks))
 
 
@@ -208,6 +228,9 @@ def _estimates(material) -> list[Section]:
         in_world = m.is_truth and m.smoothed.surface is not None \
             and np.any(m.reference.position_world)
         sections += smoother_sections(m.smoothed, m.reference if in_world else None)
+        slope = slope_of(m.smoothed, m.raw)
+        if slope is not None:
+            sections.insert(1, slope_section(slope, contents.log(MAGNETOMETER)))
     if m.estimate is not None:
         sections.append(orientation_section(m.estimate, m.origin, m.reference,
                                             contents.reference_name or "", m.shades))

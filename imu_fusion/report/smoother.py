@@ -13,11 +13,12 @@ from imu_fusion.estimation.smoother.state import BLOCKS
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
-from imu_fusion.report.html import Figure, Number, Section, Table, Text
+from imu_fusion.report.html import Block, Figure, Number, Section, Table, Text
 from imu_fusion.report.orientation import angle_panels
 from imu_fusion.report.overview import number
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
 from imu_fusion.samples import AttitudeLog, FixLog, PoseLog, VelocityLog, seconds
+from imu_fusion.streams.smoother import constant_states
 from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
@@ -83,12 +84,13 @@ def smoother_sections(smoothed: Smoothed, reference: PoseLog | None = None) -> l
         sections.append(_jump(smoothed))
     if reference is not None:
         sections.append(_truth(smoothed, reference))
-    sections += [_velocity(smoothed), _attitude(smoothed), _errors(smoothed)]
+    sections += [_velocity(smoothed), _attitude(smoothed), *_errors(smoothed)]
     if smoothed.fix is not None:
         sections.append(_before_after(smoothed))
-    sections.append(_innovations(smoothed))
-    if smoothed.surface is not None:
-        sections.append(_residuals(smoothed))
+    if smoothed.result.innovations:
+        sections.append(_innovations(smoothed))
+        if smoothed.surface is not None:
+            sections.append(_residuals(smoothed))
     return sections
 
 
@@ -120,7 +122,8 @@ def _trajectory(smoothed):
     return Section("Trajectory", (
         Text(smoothed.result.summary()[:1].upper() + smoothed.result.summary()[1:]
              + f". East, north and up are counted from {place}."),
-        Figure(figure, "Drag to turn, scroll to come closer." + heights, linked=False),
+        Figure(figure, "The smoothed trajectory, coloured by speed, and the fixes. Drag to turn, "
+               "scroll to come closer." + heights, linked=False),
         Figure(map_figure(samples, fixes), "From above: fixes as recorded, and smoothed.",
                linked=False),
         Table(("quantity", "value", "unit"), rows)))
@@ -146,13 +149,14 @@ def _jump(smoothed):
             row("flight time", jump.flight_time, jump.flight_time_sd, "s", 3),
             row("landing speed", jump.landing_speed, jump.landing_speed_sd, "m/s"),
             event("take-off", jump.takeoff_stamp), event("touch-down", jump.touchdown_stamp))
-    figure = side_figure(smoothed.surface, result.samples, smoothed.fixes_world()[1],
-                         result.events)
-    return Section("Jump", (
-        Table(("quantity", "value", "σ", "unit"), rows,
-              "The length is counted along the landing profile, as the markers of a hill stand."),
-        Figure(figure, "From the side, at one scale: drag to zoom, double-click to go back.",
-               linked=False)))
+    blocks: list[Block] = [Table(
+        ("quantity", "value", "σ", "unit"), rows,
+        "The length is counted along the landing profile, as the markers of a hill stand.")]
+    if isinstance(smoothed.surface, Hill):
+        figure = side_figure(smoothed.surface, result.samples, smoothed.fixes_world()[1],
+                             result.events)
+        blocks.append(Figure(figure, "From the side, at one scale.", linked=False))
+    return Section("Jump", tuple(blocks))
 
 
 def _flight(smoothed):
@@ -248,27 +252,31 @@ def _attitude(smoothed):
 
 
 def _errors(smoothed):
+    """Sections, none if nothing is known of the errors of the sensors."""
     samples, time = smoothed.result.samples, smoothed.time
     panels = []
     for name, unit, scale in (("gyr", "°/s", np.degrees(1.0)), ("acc", "m/s²", 1.0)):
+        if np.isnan(samples[f"{name}_bias"]).all():    # not in a recording
+            continue
         what = {"gyr": "gyroscope bias", "acc": "accelerometer bias"}[name]
         panels.append(_components(time, scale * samples[f"{name}_bias"],
                                   scale * samples[f"{name}_bias_sd"], what, unit, _XYZ))
-    rows = []
+    rows, constant = [], constant_states(smoothed.result.states)
     for name, (values, sd) in smoothed.result.states.items():
         block = _STATES[name]
         what, unit, scale, names = block.title, block.unit, block.factor, block.components
-        # Constant states wander by rounding only.
-        if (np.ptp(values, axis=0) > 1e-6 * sd.max(axis=0)).any():
-            panels.append(_components(time, scale * values, scale * sd, what, unit, names))
-        else:
+        if name in constant:
             rows += [(what, part, number(scale * values[0, i], 3), number(scale * sd[0, i], 3),
                       unit) for i, part in enumerate(names)]
-    blocks = [_figure(smoothed, panels, "Errors of the sensors as estimated, with three "
-                      "standard deviations.", panel_height=180)]
+        else:
+            panels.append(_components(time, scale * values, scale * sd, what, unit, names))
+    blocks: list[Block] = []
+    if panels:
+        blocks.append(_figure(smoothed, panels, "Errors of the sensors as estimated, with three "
+                              "standard deviations.", panel_height=180))
     if rows:
         blocks.append(Table(("constant state", "", "value", "σ", "unit"), tuple(rows)))
-    return Section("Sensor errors", tuple(blocks))
+    return [Section("Sensor errors", tuple(blocks))] if blocks else []
 
 
 def _components(time, values, sd, what, unit, names):

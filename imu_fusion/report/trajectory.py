@@ -54,6 +54,7 @@ def space_figure(samples: np.ndarray, time: np.ndarray, fixes_world: np.ndarray,
     marks = _speed_marks(speed, 2, x=1.0, len=0.7)
     figure.add_trace(go.Scatter3d(
         **_xyz(position), mode="lines", name="smoothed", customdata=np.float32(time).tolist(),
+        showlegend=False,    # plotly warns of a legend of colours by value
         line=dict(width=5, color=marks["color"], colorscale=marks["colorscale"],
                   colorbar=marks["colorbar"], showscale=True),
         hovertemplate="%{customdata:.2f} s<br>east %{x:.1f} m<br>north %{y:.1f} m<br>"
@@ -80,7 +81,7 @@ def _side_view(position_world):
     _, directions = np.linalg.eigh(centred.T @ centred)
     across = directions[:, 0]
     across = across if across[1] < 0 else -across
-    return float(1.55 * across[0]), float(1.55 * across[1]), 0.85
+    return float(1.8 * across[0]), float(1.8 * across[1]), 0.95
 
 
 def _xyz(points):

@@ -9,6 +9,7 @@ half of one) follows the first of the topics that have one clock: what is later 
 that one's epoch belongs to the next. It is given ``JUMP`` to show the jump itself.
 """
 
+from array import array
 from collections import deque
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,31 @@ def joined(parts: Sequence[Samples]) -> Samples:
         return parts[0]
     return (np.concatenate([stamp for stamp, _ in parts]),
             np.concatenate([values for _, values in parts]))
+
+
+class Growing:
+    """Samples of one topic that follow each other, in memory that grows in place.
+
+    Args:
+        width: numbers of a sample.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._stamp, self._values = array("q"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamp)
+
+    def add(self, stamp: np.ndarray, values: np.ndarray) -> None:
+        """Copy the next n samples: (n,) int64 ns, (n, width) float64."""
+        self._stamp.frombytes(stamp.tobytes())
+        self._values.frombytes(values.tobytes())
+
+    def take(self) -> Samples:
+        """All of them; none are left."""
+        stamp, values, self._stamp, self._values = self._stamp, self._values, array("q"), array("d")
+        return np.asarray(stamp), np.asarray(values).reshape(-1, self._width)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.samples.findings import Finding
-from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, seconds
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
 from imu_fusion.samples.turning import check_turning
 
 # Longer than this many usual intervals: at least one sample is missing.
@@ -33,6 +33,7 @@ _HALVES = 0.2       # share of messages that hold one half alone
 _TURNED = 0.2       # rad: more than a sensor at rest does
 _UPSIDE_DOWN = 0.9  # share of gravity along -z
 _FLAT_TOP = 3
+_COARSE = 15.0      # m: GNSS under trees or in streets states less
 _DISTINCT = 20
 
 
@@ -40,19 +41,40 @@ _DISTINCT = 20
 class Timing:
     """The stamps of one stream, in the order given.
 
+    ``first`` and ``last`` are the least and the greatest of them, int ns, 0 without any;
     ``interval_s`` is the median of the positive intervals, ``jitter_s`` half the width of the
     central 68 % of them; ``gaps`` are intervals above GAP_FACTOR times the median.
     """
 
     count: int
-    duration_s: float
-    rate_hz: float
+    first: int
+    last: int
     interval_s: float
     jitter_s: float
     gaps: int
     longest_gap_s: float
     repeated: int
     backwards: int
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last."""
+        return (self.last - self.first) * 1e-9
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean rate, nan where no time passes."""
+        return (self.count - 1) / self.duration_s if self.last > self.first else np.nan
+
+    def followed_by(self, later: "Timing") -> "Timing":
+        """Of this stretch and a next one, which begins with the last stamp of this one; what is
+        usual is that of the first."""
+        usual = later if np.isnan(self.interval_s) else self
+        return Timing(
+            self.count + later.count - 1, min(self.first, later.first), max(self.last, later.last),
+            usual.interval_s, usual.jitter_s, self.gaps + later.gaps,
+            float(np.fmax(self.longest_gap_s, later.longest_gap_s)),
+            self.repeated + later.repeated, self.backwards + later.backwards)
 
 
 @dataclass(frozen=True)
@@ -72,23 +94,19 @@ def timing(stamp: np.ndarray) -> Timing:
         stamp: (n,) int64 ns in order of arrival.
     """
     stamp = np.asarray(stamp, dtype=np.int64)
-    if len(stamp) < 2:
-        return Timing(len(stamp), 0.0, np.nan, np.nan, np.nan, 0, np.nan, 0, 0)
+    if len(stamp) == 0:
+        return Timing(0, 0, 0, np.nan, np.nan, 0, np.nan, 0, 0)
+    ends = int(stamp.min()), int(stamp.max())
     step = np.diff(stamp)
+    repeated, backwards = int(np.sum(step == 0)), int(np.sum(step < 0))
     forward = step[step > 0] * 1e-9
-    duration = float(seconds(stamp.max(), stamp.min()))
     if len(forward) == 0:
-        return Timing(len(stamp), duration, np.nan, np.nan, np.nan, 0, np.nan,
-                      int(np.sum(step == 0)), int(np.sum(step < 0)))
+        return Timing(len(stamp), *ends, np.nan, np.nan, 0, np.nan, repeated, backwards)
     interval = float(np.median(forward))
     low, high = np.percentile(forward, [16, 84])
     gaps = forward[forward > GAP_FACTOR * interval]
-    return Timing(
-        count=len(stamp), duration_s=duration,
-        rate_hz=(len(stamp) - 1) / duration, interval_s=interval,
-        jitter_s=float(high - low) / 2, gaps=len(gaps),
-        longest_gap_s=float(forward.max()), repeated=int(np.sum(step == 0)),
-        backwards=int(np.sum(step < 0)))
+    return Timing(len(stamp), *ends, interval, float(high - low) / 2, len(gaps),
+                  float(forward.max()), repeated, backwards)
 
 
 def check_stamps(stamp: np.ndarray, name: str) -> list[Finding]:
@@ -336,7 +354,21 @@ def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
     if null:
         result.append(Finding("fix", f"{name}: {null} positions are 0 deg, 0 deg: a receiver "
                                      "without a fix that says it has one; they are left out"))
-    return result
+    return result + _check_coarse(log[log.usable], name)
+
+
+def _check_coarse(log, name):
+    """Fixes that say of themselves that they are no GNSS."""
+    variance = np.trace(log.cov_enu[:, :2, :2], axis1=1, axis2=2) / 2
+    sd = np.sqrt(variance[variance > 0])
+    if not len(sd) or np.median(sd) < _COARSE:
+        return []
+    return [Finding("fix", f"{name}: the positions state standard deviations of {sd.min():.0f} to "
+                           f"{sd.max():.0f} m, {np.median(sd):.0f} m as a rule: of a telephone "
+                           "network or a receiver indoors, whose errors stay for minutes "
+                           "(gnss.position_error_sd). Places and speeds made of them are guesses: "
+                           "record under the open sky, or leave the trajectory out "
+                           "(--without smoother)")]
 
 
 def _s(count: int) -> str:
@@ -356,17 +388,19 @@ def _quiet_blocks(values, stamp):
     Noise alone decides which of them is the quietest, and steady braking is as quiet as rest: all
     that are nearly so.
     """
-    values = np.asarray(values, dtype=np.float64)
-    norm = np.linalg.norm(values, axis=1)
-    finite = np.isfinite(norm)
-    together = np.column_stack([values, norm])[finite]
-    interval = timing(np.asarray(stamp)[finite]).interval_s
+    values, stamp = np.asarray(values, dtype=np.float64), np.asarray(stamp)
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        values, stamp = values[finite], stamp[finite]
+    interval = timing(stamp).interval_s
     window = max(int(round(0.5 / interval)), 2) if np.isfinite(interval) else 0
-    if not 0 < window <= len(together):
+    if not 0 < window <= len(values):
         return np.empty((0, 4))
-    blocks = together[:len(together) // window * window].reshape(-1, window, 4)
-    spread = blocks[:, :, 3].std(axis=1)
-    return blocks[spread <= _AS_QUIET * spread.min()].mean(axis=1)
+    blocks = values[:len(values) // window * window].reshape(-1, window, 3)
+    norm = np.sqrt(np.einsum("bni,bni->bn", blocks, blocks))
+    spread = norm.std(axis=1)
+    quiet = spread <= _AS_QUIET * spread.min()
+    return np.column_stack([blocks[quiet].mean(axis=1), norm[quiet].mean(axis=1)])
 
 
 def _quiet_norm(values, stamp):

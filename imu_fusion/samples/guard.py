@@ -143,8 +143,10 @@ class Guard:
             return False
         if stamp[0] < 0 or not np.isfinite(values).all():
             return False
+        if len(stamp) == 1:
+            return True
         step = stamp[1:] - stamp[:-1]
-        return not len(step) or bool(step.min() > 0 and step.max() <= JUMP)
+        return bool(step.min() > 0 and step.max() <= JUMP)
 
     def _follows(self, stamp: int, limit: int) -> bool:
         return self.last is None or 0 < stamp - self.last <= limit
@@ -271,3 +273,18 @@ def guard_log(log: AnyLog, small_jumps: bool = True) -> tuple[AnyLog, np.ndarray
     keep = np.concatenate([run.values[:, 0] for run in runs]).astype(np.int64)
     epochs = np.concatenate([np.full(len(run.stamp), run.epoch) for run in runs])
     return (log, epochs, guard) if len(keep) == len(log) else (log[keep], epochs, guard)
+
+
+def usable_part(log: AnyLog, name: str) -> tuple[AnyLog, list[str]]:
+    """The usable samples of a whole log up to where its clock was set back.
+
+    Returns:
+        (log, texts on what was left out, that begin with ``name``)
+    """
+    kept, epochs, guard = guard_log(log)
+    texts = [f"{name}: {count} samples left out: {reason}"
+             for reason, count in guard.refused().items()]
+    if len(epochs) and epochs[-1] > 0:
+        texts.append(f"{name}: the clock was set back; only what comes before is used")
+        kept = kept[epochs == 0]
+    return kept, texts

@@ -10,8 +10,7 @@ import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import ImuLog, MagLog, seconds
@@ -51,7 +50,8 @@ class Verdict:
     @property
     def angle(self) -> float:
         """Of the rotation ``axes``."""
-        return float(Rotation.from_matrix(self.axes).magnitude()) if np.linalg.det(self.axes) > 0 \
+        rotation = scipy.spatial.transform.Rotation
+        return float(rotation.from_matrix(self.axes).magnitude()) if np.linalg.det(self.axes) > 0 \
             else float("nan")
 
     @property
@@ -119,13 +119,14 @@ class Windows:
     def turns(self, scale: float = 1.0) -> np.ndarray:
         """Rotations (w, n, 3, 3) from the axes of each step to those of the first."""
         w, n, _ = self.rates.shape
-        steps = Rotation.from_rotvec((scale * self.step * self.rates).reshape(-1, 3))
+        rotation = scipy.spatial.transform.Rotation
+        steps = rotation.from_rotvec((scale * self.step * self.rates).reshape(-1, 3))
         steps = steps.as_matrix().reshape(w, n, 3, 3)
         result = np.empty_like(steps)
         result[:, 0] = np.eye(3)
         for i in range(1, n):
             # Half of the turn of either step lies between their middles.
-            half = Rotation.from_rotvec(0.5 * scale * self.step
+            half = rotation.from_rotvec(0.5 * scale * self.step
                                         * (self.rates[:, i - 1] + self.rates[:, i])).as_matrix()
             result[:, i] = result[:, i - 1] @ half
         return result
@@ -219,12 +220,13 @@ def _best_rotation(spread_of, axes):
     """The rotation near (or far from) ``axes`` with the least spread, and that."""
     if np.linalg.det(axes) < 0.0:
         axes = -axes
-    found = minimize(
-        lambda turn: spread_of(Rotation.from_rotvec(turn).as_matrix() @ axes).sum(), np.zeros(3),
+    rotation = scipy.spatial.transform.Rotation
+    found = scipy.optimize.minimize(
+        lambda turn: spread_of(rotation.from_rotvec(turn).as_matrix() @ axes).sum(), np.zeros(3),
         method="Nelder-Mead", options={"maxfev": 120, "xatol": 1e-2, "fatol": 0.0,
                                        "initial_simplex": 0.4 * np.vstack([np.zeros(3),
                                                                            np.eye(3)])})
-    axes = Rotation.from_rotvec(found.x).as_matrix() @ axes
+    axes = rotation.from_rotvec(found.x).as_matrix() @ axes
     return spread_of(axes), axes
 
 

@@ -73,6 +73,10 @@ SENSOR: dict[str, dict[str, Any]] = {
     "mag_scale_sd": dict(
         low=1e-6, high=1.0,
         doc="Standard deviation of the magnetometer's scale errors, as states."),
+    "mag_axes_sd": dict(
+        unit="rad", low=0.0, high=0.5,
+        doc="Standard deviation of how the magnetometer is turned against the Imu, about each "
+            "axis, as states; 0: known exactly, no states. An ellipsoid does not show it."),
     "mag_range": dict(
         unit="T", low=1e-6, length=(1, 3),
         doc="Largest field that the magnetometer reports, one value or one per axis, before "

@@ -5,6 +5,7 @@ switched on, here from :data:`~imu_fusion.sources.source.EPOCH`; that of its GNS
 A receiver's row without height is no fix; accuracies are not logged and stay unknown.
 """
 
+import math
 import re
 from datetime import UTC, datetime
 
@@ -171,8 +172,11 @@ class AvanodeGnss(Source):
         try:
             year, month, day, hour, minute, second = map(int, text.split(":"))
             date = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-            return int(date.timestamp()) * 10**9 + round(tow % 1000) * 1_000_000
-        except (ValueError, TypeError):
+            stamp = int(date.timestamp()) * 10**9 + round(math.fmod(tow, 1000)) * 1_000_000
+            if 0 <= stamp < 2**63:
+                return stamp
+            raise ValueError
+        except (ValueError, TypeError, OverflowError):
             if not fixed:
                 return None    # the receiver does not know the date yet
             raise SampleError(f"{self._part}, line {line}, column 'utc': '{text}' is not a date, "

@@ -73,6 +73,8 @@ class Gpx(Source):
             stamp = int(at.replace(microsecond=0).timestamp()) * 10**9 + at.microsecond * 1000
             place = (float(element.attrib["lat"]), float(element.attrib["lon"]),
                      float(str(texts["ele"])))
+            if stamp >= 2**63:
+                raise ValueError
         except (ValueError, KeyError, OverflowError):
             raise SampleError(f"{self._part}: a track point at {text[:40]} has no latitude, "
                               "longitude, elevation or time that can be read") from None

@@ -13,7 +13,6 @@ or do not say). Protocol: https://phyphox.org/wiki/index.php/Remote_interface_co
 
 import io
 import json
-import math
 import re
 import zipfile
 from pathlib import PurePosixPath
@@ -42,6 +41,8 @@ from imu_fusion.sources.source import (
 from imu_fusion.sources.table import UNKNOWN_CLIMB_SD, Rows, TableReader
 
 NANOSECONDS = 1_000_000_000
+_LONGEST = 1e9    # s, of an experiment
+_UNIX = (1e8, 9e9)    # s, of a clock that has been set
 # A phone's ground speed comes without accuracy; receivers are within some 0.5 m/s.
 _SPEED_SD = 0.5
 _ACCELERATION, _RATE, _FIELD = ("m/s^2", "m/s²"), ("rad/s",), ("µT", "μT")
@@ -87,7 +88,8 @@ def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
     fixes = FixLog(stamp, lat, lon, height, cov, np.where(valid, FIXED, NO_FIX))[there]
     course = np.radians(direction)    # clockwise from north
     moves = (speed >= 0) & (direction >= 0)
-    vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
+    with np.errstate(invalid="ignore", over="ignore"):    # of an infinite one
+        vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
     cov = np.tile(np.diag([_SPEED_SD, _SPEED_SD, UNKNOWN_CLIMB_SD]) ** 2, (len(stamp), 1, 1))
     return named({FIX_TOPIC: fixes, VELOCITY_TOPIC: VelocityLog(stamp, vel, cov)[moves]})
 
@@ -263,12 +265,12 @@ def _clock(sheet: _Sheet | None) -> list[tuple[float, int]] | None:
     since, unix = sheet.column(names[1]), sheet.column(names[2])
     starts = [(float(t), round(u * 1000) * 1_000_000 - round(t * NANOSECONDS))
               for event, t, u in zip(events, since, unix)
-              if event == "START" and math.isfinite(t) and math.isfinite(u) and u > 1e8]
+              if event == "START" and abs(t) < _LONGEST and _UNIX[0] < u < _UNIX[1]]
     return starts or None
 
 
 def _stamps(sheet: _Sheet, time: np.ndarray, clock: list[tuple[float, int]] | None) -> np.ndarray:
-    bad = ~((time >= 0) & (time < 1e9))
+    bad = ~((time >= 0) & (time < _LONGEST))
     if bad.any():
         k = int(np.argmax(bad))
         raise SampleError(f"{sheet.where}, line {sheet.rows.lines[k]}, column 'Time': {time[k]:g} "
@@ -322,7 +324,8 @@ class PhyphoxLive(Source):
                 self._set_clock(answer)
             elif part.startswith("/get"):
                 return self._readings(answer)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError,
+                OverflowError) as error:
             if isinstance(error, SampleError):
                 raise
             self.lose("answers that are not phyphox's", part[:20])
@@ -351,8 +354,10 @@ class PhyphoxLive(Source):
         starts = [e for e in events if e.get("event") == "START"]
         if starts:
             last = starts[-1]
-            self._zero = (round(float(last["systemTime"]) * 1000) * 1_000_000
-                          - round(float(last["experimentTime"]) * NANOSECONDS))
+            since, unix = float(last["experimentTime"]), float(last["systemTime"])
+            if not (abs(since) < _LONGEST and _UNIX[0] < unix < _UNIX[1]):
+                raise ValueError
+            self._zero = round(unix * 1000) * 1_000_000 - round(since * NANOSECONDS)
 
     def _readings(self, answer):
         status = answer.get("status", {})
@@ -381,7 +386,7 @@ class PhyphoxLive(Source):
             columns = {o: arrays.get(name, np.empty(0)) for o, name in outputs.items()}
             # A reading may have reached some of its buffers when the phone answers.
             n = min(len(c) for o, c in columns.items() if len(c) or o in "xyzt")
-            new = np.flatnonzero(np.isfinite(time[:n]) & (time[:n] > (
+            new = np.flatnonzero((time[:n] >= 0) & (time[:n] < _LONGEST) & (time[:n] > (
                 -np.inf if last is None else last)))
             if len(new):
                 self._last[sensor] = float(time[new[-1]])

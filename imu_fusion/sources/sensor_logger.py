@@ -116,7 +116,8 @@ def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
     there = np.isfinite(values[:, :3]).all(axis=1)
     fixes = FixLog(stamp, lat, lon, height, cov, np.where(valid, FIXED, NO_FIX))[there]
     course = np.radians(bearing)
-    vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
+    with np.errstate(invalid="ignore", over="ignore"):    # of an infinite one
+        vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
     cov = np.zeros((len(stamp), 3, 3))
     for k in (0, 1):
         cov[known, k, k] = sd_speed[known] ** 2
@@ -137,7 +138,11 @@ def _read(part: str, data: bytes, names: tuple[str, ...]) -> tuple[np.ndarray, n
     if not rows.lines:
         return np.empty(0, np.int64), np.empty((0, len(names)))
     known = {name.lower(): name for name in reader.names or ()}
-    stamp = np.array(reader.stamps(rows, _TIME), dtype=np.int64)
+    stamps = reader.stamps(rows, _TIME)
+    if min(stamps) < 0 or max(stamps) >= 2**63:
+        raise SampleError(f"{part}: column 'time' goes from {min(stamps):.4g} to "
+                          f"{max(stamps):.4g}, which are no nanoseconds since 1970")
+    stamp = np.array(stamps, dtype=np.int64)
     none = np.full(len(stamp), np.nan)
     columns = [reader.column(rows, known[name]) if name in known else none for name in names]
     order = np.argsort(stamp, kind="stable")
@@ -200,7 +205,9 @@ class SensorLoggerPush(Source):
             batch = json.loads(data)
             number, session = int(batch["messageId"]), str(batch["sessionId"])
             payload = list(batch["payload"])
-        except (ValueError, KeyError, TypeError, RecursionError):
+            if not 0 <= number < 2**53:
+                raise ValueError
+        except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
             self.lose("batches that are not Sensor Logger's")
             return []
         self.device = f"Sensor Logger: {batch.get('deviceId', '')}"[:80]

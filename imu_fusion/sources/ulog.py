@@ -10,7 +10,7 @@ import io
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import SampleError
 from imu_fusion.samples.logs import FixLog, MagLog, PoseLog, VelocityLog
@@ -31,10 +31,12 @@ from imu_fusion.sources.source import (
 MAGIC = b"ULog\x01\x12\x35"
 ONBOARD_TOPIC = "onboard_ekf/pose"
 _FLU_FRD = np.array([1.0, -1.0, -1.0])
-_ENU_NED = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_ENU_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRD_FLU = np.array([1.0, 0.0, 0.0, 0.0])    # half a turn about forward
 _NO_FORCE = 0x7FFFFFFF    # as accelerometer_timestamp_relative
 _GAUSS = 1e-4
 _FIX_3D = 3
+_UTC = 1_000_000_000_000_000, 9_000_000_000_000_000    # us, of a receiver that knows it
 _READS = 200_000     # more than a step back of a message takes, byte by byte
 _WANTED = ["sensor_combined", "vehicle_magnetometer", "sensor_mag", "vehicle_gps_position",
            "sensor_gps", "vehicle_attitude"]
@@ -85,7 +87,11 @@ class Ulog(WholeSource):
         for dataset in log.data_list:
             if len(dataset.data.get("timestamp", ())):
                 sets.setdefault(dataset.name, dataset.data)
-        blocks = self._blocks(sets)
+        try:
+            blocks = self._blocks(sets)
+        except LookupError as error:
+            raise SampleError(f"{part}: its definitions are damaged: there is no {error}"
+                              ) from None
         if not blocks:
             raise SampleError(f"{part}: none of {', '.join(_WANTED)} was logged")
         return blocks
@@ -121,8 +127,9 @@ class Ulog(WholeSource):
             quat = _vector(attitude, "q", 4)[:, [1, 2, 3, 0]]
             fine = np.linalg.norm(quat, axis=1) > 0.5
             stamp = _stamps(attitude["timestamp"], zero)[fine]
-            body = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])    # half a turn about forward
-            found = (_ENU_NED * Rotation.from_quat(quat[fine]) * body).as_quat()
+            world, ned, body = map(scipy.spatial.transform.Rotation.from_quat,
+                                   (_ENU_NED, quat[fine], _FRD_FLU))
+            found = (world * ned * body).as_quat()
             blocks += named({ONBOARD_TOPIC: PoseLog(stamp, found, np.zeros((len(stamp), 3)))})
         return blocks
 
@@ -130,7 +137,7 @@ class Ulog(WholeSource):
         """UTC of boot in ns."""
         if gps is not None:
             utc, boot = (gps[n].astype(np.int64) for n in ("time_utc_usec", "timestamp"))
-            known = utc > 1_000_000_000_000_000
+            known = (utc > _UTC[0]) & (utc < _UTC[1]) & (boot >= 0) & (boot < _UTC[0])
             if known.any():
                 return int(np.median(utc[known] - boot[known])) * 1000
         self.remark("the receiver never knew UTC: stamps begin at an arbitrary instant")

@@ -2,14 +2,19 @@
 
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import EstimationError, ParameterError
+from imu_fusion.errors import EstimationError, ParameterError, SampleError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
-from imu_fusion.estimation.acceleration_field.impact_metrics import ImpactParams, measure_impacts
+from imu_fusion.estimation.acceleration_field.impact_metrics import (
+    UNITS,
+    ImpactParams,
+    corner_frequency,
+    find_peaks,
+    measure_impacts,
+)
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
     AccelerometerParams,
@@ -26,7 +31,7 @@ from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
 from imu_fusion.parameters.declare import Parameters, flatten, param
-from imu_fusion.parameters.file import node_values
+from imu_fusion.parameters.file import ParamsFile, node_values, source_of
 from imu_fusion.samples import AccelerometerLog, ImuLog
 from imu_fusion.samples.blocks import Samples
 from imu_fusion.samples.matching import SampleMatcher
@@ -114,6 +119,14 @@ class FieldConfiguration:
         if rows_of and rows_of not in accelerometers:
             raise ParameterError(f"parameter 'match.rows_of': no accelerometer '{rows_of}'; there "
                                  f"are: {', '.join(accelerometers)}")
+        for name in ("linear_class", "angular_class"):
+            channel_class = getattr(stream.impact, name)
+            if channel_class is not None:
+                try:
+                    corner_frequency(channel_class, field.sample_rate)
+                except SampleError as error:
+                    raise ParameterError(f"parameter 'impact.{name}': {error}; the rate is that of "
+                                         "the parameter sample_rate") from None
         return cls(field, stream, accelerometers)
 
     @staticmethod
@@ -181,6 +194,7 @@ class AccelerationFieldStream(Stream):
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
         self._impacts: list[dict[str, Any]] = []
+        self._peaks: list[dict[str, Any]] = []    # of each stretch between restarts
         super().reset(session_topics)
 
     def restart(self) -> None:
@@ -207,27 +221,38 @@ class AccelerationFieldStream(Stream):
             self.warn(str(error))
             return []
         if self._rows:
-            self._impacts += _impacts(self.config, np.concatenate(self._rows))
+            rows, field = np.concatenate(self._rows), self.config.field
+            self._peaks.append(find_peaks(rows, field.points, field.gravity))
+            self._impacts += measure_impacts(rows, field.points, field.gravity,
+                                             self.config.stream.impact)
             self._rows = []
         return made
 
     def conclude(self) -> Conclusion:
-        """How the sensors fit, and the metrics of impacts where there are any."""
+        """How the sensors fit, the greatest magnitudes, and the metrics of impacts if there are
+        any."""
         results: dict[str, Any] = {}
         fits = self.estimator.sensor_fits()
         if fits:
             results["accelerometers"] = {fit.name: fit.numbers() for fit in fits}
-        remarks = self.remarks()
+        impact, remarks, summary = self.config.stream.impact, self.remarks(), ""
+        if self._peaks:
+            peaks = max(self._peaks, key=lambda found: max(found["peak_linear_acceleration"]))
+            results["units"], results["peaks"] = UNITS, peaks
+            first = peaks["peak_linear_acceleration"][0]
+            if impact.detect and not self._impacts:
+                remarks.append("no impact was measured: the linear acceleration at the first "
+                               f"point reaches {first:.3g} m/s^2, impact.trigger is "
+                               f"{impact.trigger:.3g} m/s^2; lower it for a light impact, or set "
+                               "impact.detect: false where there is none")
         if remarks:
             results["remarks"] = remarks
-        if not self.config.stream.impact.detect:
-            return Conclusion(results=results, remarks=remarks)
         if self._impacts:
             results["impacts"] = self._impacts
-        number = len({impact["stamp"] for impact in self._impacts})
-        return Conclusion(
-            results=results, remarks=remarks,
-            summary=f"{number} impacts above {self.config.stream.impact.trigger:g} m/s^2")
+        if impact.detect:
+            number = len({found["stamp"] for found in self._impacts})
+            summary = f"{number} impacts above {impact.trigger:g} m/s^2"
+        return Conclusion(results=results, remarks=remarks, summary=summary)
 
     def remarks(self) -> list[str]:
         found = self.estimator.remarks()
@@ -276,15 +301,11 @@ class AccelerationFieldStream(Stream):
         return messages(self.config, rows)
 
 
-def _impacts(config, rows):
-    return measure_impacts(rows, config.field.points, config.field.gravity, config.stream.impact)
-
-
 NODE_PARAMETERS = (EstimatorNodeParams, AccelerationFieldParams, FieldStreamParams)
 
 
-def read_configuration(params_file: str | Path | None) -> FieldConfiguration:
-    """The FieldConfiguration in a parameter file (or None).
+def read_configuration(params_file: ParamsFile) -> FieldConfiguration:
+    """The FieldConfiguration in a ParamsFile.
 
     Raises:
         ParameterError, LayoutError: with the name of what is wrong.
@@ -293,7 +314,7 @@ def read_configuration(params_file: str | Path | None) -> FieldConfiguration:
     values = node_values(NODE, params_file, FieldConfiguration.names() | old)
     for info in EstimatorNodeParams.infos():
         values.pop(info.name, None)
-    return FieldConfiguration.from_mapping(values, str(params_file or ""))
+    return FieldConfiguration.from_mapping(values, source_of(params_file))
 
 
 def _configure(stage, params_file):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Container, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,11 +28,13 @@ from imu_fusion.messages.orientation_status import (
     flags_message,
     lasting_flags,
 )
+from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE, transform_messages
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples import ImuLog, MagLog, checks
 from imu_fusion.samples.blocks import Samples, joined
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.turning import check_axes, check_turning
+from imu_fusion.sensors.linear_calibration import ImuCalibration
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
@@ -64,7 +66,7 @@ _CALIBRATION_INTERVAL = 50_000_000  # ns; turning sensors show a new direction a
 
 @dataclass(frozen=True)
 class OrientationOutputParams(Parameters):
-    """What is done with an orientation before it is published."""
+    """What surrounds the estimator: samples before it, its orientation before it is published."""
 
     remove_gravity_vector: bool = param(
         False, doc="Publish imu/data with gravity taken out of the linear acceleration.")
@@ -72,9 +74,15 @@ class OrientationOutputParams(Parameters):
                            doc="Gravity that remove_gravity_vector takes out.")
     heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
                                doc="Yaw that the service set_heading makes the present one.")
-    publish_tf: bool = param(False, doc="Also broadcast the orientation as the transform from "
-                             "fixed_frame to the Imu's frame (node only; needs tf2_ros).")
+    publish_tf: bool = param(False, doc="Also write the orientation to /tf, from fixed_frame to "
+                             "the frame of the Imu. The node needs tf2_msgs.")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
+    calibration: ImuCalibration = ImuCalibration()
+
+
+def outputs_of(output: OrientationOutputParams) -> dict[str, str]:
+    """Topics and types of what is published under these parameters."""
+    return OUTPUTS | ({TF_TOPIC: TF_TYPE} if output.publish_tf else {})
 
 
 def _without_lost(acc, had_force):
@@ -130,9 +138,14 @@ class _Writer:
         rows, cdrs = self._orientations(rows, frame_id)
         east = quat_rotate(rows["quat_world_imu"][-1], (1.0, 0.0, 0.0))
         self.yaw = math.atan2(self._up * east[1], east[0])
-        return [Messages(ORIENTATION_TOPIC, stamp, cdrs),
+        made = [Messages(ORIENTATION_TOPIC, stamp, cdrs),
                 Messages(RPY_TOPIC, stamp, rpy_messages(rows, frame_id)),
                 *self._status(rows, frame_id), *self._biases(rows, frame_id)]
+        if self._output.publish_tf:
+            made.append(Messages(TF_TOPIC, stamp, transform_messages(
+                stamp, self._output.fixed_frame, frame_id, np.zeros((len(rows), 3)),
+                rows["quat_world_imu"])))
+        return made
 
     def corrected(self, rows, frame_id):
         """Messages of rows that looking ahead has corrected."""
@@ -240,7 +253,7 @@ class OrientationStream(Stream):
         self.estimator = OrientationEstimator(params)
         self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
         self._calibration_pace = _Pace(_CALIBRATION_INTERVAL)
-        super().__init__(INPUTS, warn)
+        super().__init__(INPUTS, warn, output.calibration)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
         self._writer = _Writer(self.params, self.output)
@@ -364,8 +377,9 @@ class OrientationStream(Stream):
     def _collect(self, stamps, values):
         """Samples for a calibration of the magnetometer, as often as they may be new."""
         usable = ~self._screen.saturated(values)
-        for k in self._calibration_pace.chosen(stamps[usable]):
-            self._calibrator.add(values[usable][k])
+        stamps, values = stamps[usable], values[usable]
+        for k in self._calibration_pace.chosen(stamps):
+            self._calibrator.add(values[k])
 
     def _write(self, rows):
         frame_id = self.frame_ids.get(IMU_TOPIC, "")
@@ -396,5 +410,11 @@ def findings(logs: Mapping[str, Any]) -> list[Finding]:
     return found
 
 
+def _configure(stage, params_file):
+    params, output = stage.read_params(params_file)
+    return replace(stage, outputs=outputs_of(output)), [params, output]
+
+
 STAGE = Stage("orientation_estimator", (OrientationParams, OrientationOutputParams),
-              (EstimatorNodeParams,), INPUTS, (IMU_TOPIC,), OUTPUTS, OrientationStream, findings)
+              (EstimatorNodeParams,), INPUTS, (IMU_TOPIC,), OUTPUTS, OrientationStream, findings,
+              _configure)

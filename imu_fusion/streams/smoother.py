@@ -37,6 +37,7 @@ from imu_fusion.samples import checks
 from imu_fusion.samples.blocks import Samples, joined
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.turning import check_axes
+from imu_fusion.sensors.linear_calibration import ImuCalibration
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
 from imu_fusion.surfaces.file import load_surface
@@ -100,6 +101,7 @@ class SmoothingParams(SmootherParams):
         False, doc="First recover rates beyond the gyroscope's range from the magnetometer, as the "
         "orientation estimator does on a whole recording, and take them with their covariance. "
         "Set it for a body that tumbles beyond the range.")
+    calibration: ImuCalibration = ImuCalibration()
     surface: SurfaceFile = SurfaceFile()
     frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
@@ -160,7 +162,7 @@ class SmootherStream(Stream):
                  warn: Callable[[str], object] = lambda text: None) -> None:
         self.params = params
         self.limit = limit
-        super().__init__(INPUTS, warn)
+        super().__init__(INPUTS, warn, params.calibration)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
         self._collected: dict[str, list[Samples]] = {topic: [] for topic in INPUTS}
@@ -286,10 +288,13 @@ class Outcome:
     def of(cls, result: SmootherResult, frame_id: str) -> Self:
         """Of a SmootherResult."""
         numbers: dict[str, Any] = {
-            "samples": len(result.samples), "iterations": result.iterations,
+            "samples": len(result.samples), "origin": asdict(result.frame),
+            "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
             "adapted": result.adapted, "noise": result.noise,
+            "states": {name: {"value": value.tolist(), "sd": sd.tolist()}
+                       for name, (value, sd) in constant_states(result.states).items()},
             "outliers": {name: asdict(found) for name, found in result.outliers().items()}}
         if result.gnss_step is not None:
             numbers["gnss_step"] = {"stamp": result.gnss_step.stamp,
@@ -312,6 +317,15 @@ class Outcome:
             stamp, world, _NAME, self.summary,
             {key: json.dumps(value) for key, value in self.numbers.items()},
             bool(self.remarks), self.frame_id)
+
+
+def constant_states(states: Mapping[str, tuple[np.ndarray, np.ndarray]]
+                    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Name -> value (k,) and standard deviation (k,), in SI units, of the states that stay the same
+    over a recording; ``states`` as in a SmootherResult."""
+    # They wander by rounding.
+    return {name: (values[0], sd[0]) for name, (values, sd) in states.items()
+            if len(values) and (np.ptp(values, axis=0) <= 1e-6 * sd.max(axis=0)).all()}
 
 
 def results_value(cdr: bytes) -> dict[str, Any]:

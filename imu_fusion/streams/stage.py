@@ -3,12 +3,11 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
-from imu_fusion.parameters.file import parameters_for
+from imu_fusion.parameters.file import ParamsFile, parameters_for
 from imu_fusion.samples.findings import Finding
 
 
@@ -42,11 +41,11 @@ class Stage:
     outputs: Mapping[str, str]
     stream: type[Any]
     findings: Callable[[Mapping], Sequence[Finding]] = _no_findings
-    configure: Callable[["Stage", str | Path | None], tuple["Stage", list]] | None = None
+    configure: Callable[["Stage", ParamsFile], tuple["Stage", list]] | None = None
     unusable: str = ""
 
-    def prepare(self, params_file: str | Path | None = None) -> tuple["Stage", list]:
-        """(Stage, parameters) under a parameter file, or None for defaults.
+    def prepare(self, params_file: ParamsFile = None) -> tuple["Stage", list]:
+        """(Stage, parameters) under a ParamsFile.
 
         Raises:
             ImuFusionError: the parameters, or files that they name, are not usable.
@@ -60,8 +59,8 @@ class Stage:
         judged = self.stream.one_clock
         return judged is None or topic in judged
 
-    def read_params(self, params_file: str | Path | None = None) -> list:
-        """The objects of ``params`` in a parameter file (or None: defaults)."""
+    def read_params(self, params_file: ParamsFile = None) -> list:
+        """The objects of ``params`` under a ParamsFile."""
         params = parameters_for(self.params + self.node_params, self.node, params_file)
         return params[:len(self.params)]
 

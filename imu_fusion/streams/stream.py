@@ -15,11 +15,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from imu_fusion.messages.convert import SampleType
-from imu_fusion.messages.layouts import Decoded
+from imu_fusion.messages.layouts import IMU, Decoded
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.blocks import BlockMerger, Samples, joined
 from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Guard, Verdict
+from imu_fusion.sensors.linear_calibration import ImuCalibration
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class Stream:
     Args:
         inputs: dict of topic to SampleType, in order of rank at equal stamps.
         warn: called with a text when something is wrong with the input.
+        calibration: of the Imu: what comes in is calibrated before anything else.
 
     Subclasses name in ``same_frame`` the topics whose axes must be parallel, in ``one_clock`` those
     whose sensors share a clock (None: all do, see BlockMerger), and implement
@@ -89,8 +91,10 @@ class Stream:
     concludes = False
 
     def __init__(self, inputs: Mapping[str, SampleType],
-                 warn: Callable[[str], object] = lambda text: None) -> None:
+                 warn: Callable[[str], object] = lambda text: None,
+                 calibration: ImuCalibration = ImuCalibration()) -> None:
         self.inputs = inputs
+        self._calibration = None if calibration.is_identity else calibration
         self.warn = warn
         self.undecodable: Counter[str] = Counter()
         self._merger = BlockMerger(inputs, self._refused, self.one_clock)
@@ -125,10 +129,13 @@ class Stream:
                 if topic not in self.frame_ids:
                     self.frame_ids[topic] = block.frame_ids[0]
                     self._compare_frames()
-                if not self.concludes:
+                if not self.concludes and not self._frames[topic].keys() >= set(block.frame_ids):
                     self._frames[topic] |= dict.fromkeys(block.frame_ids)
                     self._tell(f.text for f in check_frames(self._frames[topic], topic))
-                samples[topic] = block.stamp, self.inputs[topic].values(block.values)
+                values = self.inputs[topic].values(block.values)
+                if self._calibration is not None and self.inputs[topic].layout is IMU:
+                    values = self._calibration.apply(values)
+                samples[topic] = block.stamp, values
                 self._look(topic, *samples[topic])
         return self._through(self._merger.add(samples))
 

@@ -136,6 +136,28 @@ def test_batch_measures_impacts(motion, tmp_path):
     assert impacts[0]["peak_linear_acceleration"] == pytest.approx(truth, rel=2e-3)
 
 
+def test_below_the_trigger_the_peaks_are_there_with_a_hint(motion, tmp_path):
+    bag = write(tmp_path / "bag", motion, faults=False)
+    file = params_file(tmp_path / "p.yaml", **{"impact.trigger": 5000.0})
+    (report,) = [r for r in batch.process(bag, tmp_path / "out", file)[0] if not r.skipped]
+    found = json.loads((tmp_path / "out" / "results.json").read_text())[report.node]
+    assert "impacts" not in found and "impact.trigger is 5e+03" in report.remarks[-1]
+    size = np.linalg.norm(motion.acceleration_body([0, 0, 0.75]), axis=1)
+    peaks = found["peaks"]
+    assert peaks["peak_linear_acceleration"][0] == pytest.approx(size.max(), rel=2e-3)
+    assert peaks["stamp"][0] == motion.stamp[size.argmax()]
+    assert found["units"]["peak_linear_acceleration"] == "m/s^2"
+
+
+def test_a_channel_class_that_the_rate_cannot_carry_is_refused_ahead(motion, tmp_path):
+    bag = write(tmp_path / "bag", motion, faults=False)
+    file = params_file(tmp_path / "p.yaml", **{"impact.linear_class": 1000, "sample_rate": 1000.0})
+    said = []
+    with pytest.raises(ParameterError, match=r"'impact.linear_class': CFC 1000 .* 1000 Hz is too"):
+        batch.process(bag, tmp_path / "out", file, progress=said.append)
+    assert not said    # nothing was read
+
+
 def test_live_rows_leave_when_complete(graph, motion):
     readings = motion.readings(PAPER_POSITIONS, PAPER_AXES)
     node = graph.node("driver")

@@ -133,6 +133,16 @@ def test_a_node_takes_the_file_that_launch_ros_makes_of_a_list(graph, tmp_path):
     assert node.params(Numbers).axis == (0.0, 1.0, 0.0)
 
 
+def test_a_calibration_for_every_node_is_passed_by_and_a_slip_is_not(tmp_path):
+    file = tmp_path / "magnetometer.yaml"
+    arguments = ["--ros-args", "--params-file", str(file)]
+    file.write_text("/**: {ros__parameters: {sensor.mag_offset: [0.0, 0.0, 1.0e-6]}}")
+    assert run_node(Reader, arguments) == 0
+    Reader.seen.pop()
+    file.write_text("/**: {ros__parameters: {tehre: zakopane_hs140}}")
+    assert run_node(Reader, arguments) == 1
+
+
 def test_integer_ranges_fit_what_editors_take(graph):
     node = graph.start(Example)
     assert node.describe_parameter("window").integer_range[0].to_value == 2**31 - 1

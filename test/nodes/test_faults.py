@@ -117,3 +117,36 @@ def test_a_replayer_whose_recorder_has_died_does_not_play_on(tmp_path):
         trial.end("recorder", number=signal.SIGKILL)
         trial.end("replayer")    # four hundred seconds before its time
     assert trial.codes == [("recorder", -9), ("replayer", 3)] and not trial.amiss
+
+
+@pytest.mark.parametrize("command", ["pipeline", pytest.param("demo", marks=pytest.mark.slow)])
+def test_kill_9_of_a_command_ends_what_it_has_started(tmp_path, command):
+    faults.write_bag(tmp_path / "bag")
+    arguments = [word.format(tmp=tmp_path) for word in COMMANDS[command]]
+    process = subprocess.Popen([sys.executable, "-m", "imu_fusion.cli", *arguments],
+                               stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    until(lambda: len(children_of(process.pid)) >= 3, process)
+    children = children_of(process.pid)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 120.0
+    while any(is_alive(child) for child in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert not (tmp_path / "out").exists()    # and nothing of a recording that is not whole
+
+
+SWALLOWED = """
+import signal, sys
+from imu_fusion import nodes
+from imu_fusion.signals import came
+came.append(signal.SIGTERM)    # raised where an exception is not heard of, such as in a destructor
+sys.exit(nodes.main(["--ros-args", "-p", f"bag:={sys.argv[1]}"], "replayer"))
+"""
+
+
+def test_a_signal_on_the_way_to_the_node_is_not_forgotten(tmp_path):
+    faults.write_bag(tmp_path / "bag", 20)
+    done = subprocess.run([sys.executable, "-c", SWALLOWED, tmp_path / "bag"], timeout=120,
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGTERM, done

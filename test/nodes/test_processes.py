@@ -247,3 +247,17 @@ def test_the_recorder_ends_when_its_source_was_killed_and_says_so(graph, bag, tm
                           capture_output=True, text=True, timeout=60, check=False)
     assert "warning: the session of /replayer broke off" in done.stdout, done
     assert recorded(out)["/imu/data_raw"] > 20
+
+
+def test_logs_of_a_failure_stay_and_those_of_a_success_do_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(processes, "compile_ahead", lambda say: None)
+    with NodeProcesses():
+        assert len(list(tmp_path.iterdir())) == 1
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(processes.NodeError, match="logs: ") as failure, NodeProcesses() as nodes:
+        nodes.start("replayer", bag=str(tmp_path / "none"))
+        nodes.wait("replayer", 120)
+    (folder,) = tmp_path.iterdir()
+    assert str(folder) in str(failure.value) and "no such file" in str(failure.value)
+    assert "no such file" in (folder / "replayer.log").read_text()

@@ -29,8 +29,11 @@ TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix":
           "/smoother/results": DiagnosticArray}
 
 
-def write(path, count=600):
-    """Standing still at Innsbruck for six seconds, then off to the east at 1 m/s^2."""
+def write(path, count=600, without_fixes=range(0)):
+    """Standing still at Innsbruck for two seconds, then off to the east at 1 m/s^2.
+
+    without_fixes: numbers of Imu samples beside which there is no fix.
+    """
     rng = np.random.default_rng(5)
     with BagWriter(path) as writer:
         for i in range(count):
@@ -40,7 +43,7 @@ def write(path, count=600):
             force = [1.0 if t else 0.0, 0.0, 9.805]
             writer.write("/imu/data_raw", IMU.msgtype,
                          imu_message(stamp, "car", 0.001 * noise, force + noise), stamp)
-            if i % 10 == 0:
+            if i % 10 == 0 and i not in without_fixes:
                 east = 0.5 * t * t
                 writer.write("/fix", FIX.msgtype, fix_message(
                     stamp, "gnss", 47.26, 11.39 + np.degrees(east / (6388e3 * np.cos(0.8248))),
@@ -61,7 +64,8 @@ def fields(topic, cdr):
 
 
 def test_service_smooths_what_was_played_and_equals_batch(graph, tmp_path):
-    bag = write(tmp_path / "bag")
+    # The last fix comes after a pause: it waits for one after it, which does not come.
+    bag = write(tmp_path / "bag", without_fixes=range(250, 590))
     reports, _ = batch.process(bag, tmp_path / "out", without=["orientation_estimator"])
     sink = collector(graph, topics=TOPICS)
     graph.start(SmootherNode, qos="reliable")

@@ -81,6 +81,13 @@ def test_printed_it_is_yaml_and_unknown_names_are_an_error(file):
     assert yaml.safe_load(text)["orientation_estimator"]["ros__parameters"]["world_frame"] == "ned"
 
 
+def test_the_bias_of_the_complementary_filter_can_be_switched_off(tmp_path):
+    path = tmp_path / "complementary.yaml"
+    path.write_text("complementary_filter: {ros__parameters: {do_bias_estimation: false}}")
+    result = translate(str(path))
+    assert result.values == {"fusion.estimate_bias": False} and not result.left_out
+
+
 @pytest.mark.parametrize("content, text", [
     ("", "holds no parameters"),
     ("imu_filter: {ros__parameters: {declination: east}}", "'declination': 'east' is not a num")])

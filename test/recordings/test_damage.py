@@ -20,16 +20,23 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from benchmarks.fuzz import KINDS, mutated, outcome, write_db3, write_mcap, write_ros1
-from imu_fusion.cli import INCOMPLETE, cli
-from imu_fusion.errors import BagError
-from imu_fusion.messages.layouts import IMU
+from imu_fusion.cli import cli
+from imu_fusion.errors import INCOMPLETE, BagError
+from imu_fusion.messages.convert import fix_message, imu_message
+from imu_fusion.messages.layouts import FIX, IMU
 from imu_fusion.messages.typestore import TYPES
+from imu_fusion.nodes.pipeline import find_left_out, plan_pipeline
+from imu_fusion.recordings import mcap_records, ros1_storage
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.mcap_records import MAGIC
 from imu_fusion.recordings.repair import repair
+from imu_fusion.recordings.storage import DamageError
+from imu_fusion.samples.guard import Verdict
+from imu_fusion.streams.orientation import OrientationStream
+from imu_fusion.streams.smoother import SmootherStream
 from test.recordings.test_bag import START, STEP, imu, write
 
 HOSTILE = Path(__file__).parents[3] / "shared" / "cases" / "hostile"
@@ -253,11 +260,19 @@ def test_a_chunk_unpacks_within_a_bound_that_can_be_raised(tmp_path, monkeypatch
         monkeypatch.setenv("IMU_FUSION_MAX_CHUNK_MB", "50")
         result = through("info", file, None)
         assert result.exit_code == INCOMPLETE and "IMU_FUSION_MAX_CHUNK_MB" in result.output
+        assert "--max-chunk-mb" in result.output
+        assert run("--max-chunk-mb", "70", "info", file).exit_code == 0
         # What it says is not what it unpacks to.
         lying = mcap(tmp_path / "lying.mcap", schema(IMU.msgtype), channel("/imu"),
                      message(imu(0)), chunk(name, packed, 1000))
         assert "another size than the 1000 bytes" in through("info", lying, None).output
         monkeypatch.delenv("IMU_FUSION_MAX_CHUNK_MB")
+
+
+def test_a_chunk_of_zeros_is_no_million_of_records(tmp_path):
+    assert not list(mcap_records.records(bytes(100)))
+    with pytest.raises(DamageError):
+        next(ros1_storage._records(bytes(100)))
 
 
 @pytest.mark.parametrize("length", [0, 2**31 - 1, 2**32 - 1])
@@ -272,20 +287,34 @@ def test_lengths_inside_of_messages_are_not_believed(tmp_path, length):
 
 # One rule for a broken message in every door.
 
-def test_a_broken_message_among_many_stops_no_door(tmp_path):
-    bag = tmp_path / "bag"
+def test_a_broken_message_among_many_stops_no_door_and_is_counted_alike(tmp_path):
+    bag, messages = tmp_path / "bag", []
+    for i in range(400):
+        stamp = START + (i - (i == 300)) * STEP
+        cdr = imu_message(stamp, "imu", [0.0, np.nan if i == 200 else 0.0, 0.1], [0.0, 0.0, 9.81])
+        messages.append(cdr[:60] if i == 170 else cdr)
     with BagWriter(bag) as writer:
-        for i in range(400):
-            writer.write("/imu/data_raw", IMU.msgtype, imu(i)[:60] if i == 170 else imu(i),
-                         START + i * STEP)
-    assert "1 messages cannot be decoded" in through("info", bag, None).output
+        for i, cdr in enumerate(messages):
+            writer.write("/imu/data_raw", IMU.msgtype, cdr, START + i * STEP)
+            if i % 20 == 0:
+                writer.write("/fix", FIX.msgtype, fix_message(
+                    START + i * STEP, "gnss", 47.0, 11.0, 600.0, np.eye(3)), START + i * STEP)
+    info = through("info", bag, None)
+    assert info.exit_code == INCOMPLETE and "1 messages cannot be decoded" in info.output
     result = through("process", bag, tmp_path / "out")
-    assert result.exit_code == INCOMPLETE and "1 cannot be decoded" in result.output
-    found = json.loads((tmp_path / "out" / "results.json").read_text())["left_out"]
-    assert found == {"orientation_estimator": {"imu/data_raw": {"cannot be decoded": 1}}}
+    assert result.exit_code == INCOMPLETE and "1 repeated stamp" in result.output
+    why = {"cannot be decoded": 1, Verdict.NOT_FINITE.value: 1, Verdict.DUPLICATE.value: 1}
+    expected = {node: {"imu/data_raw": why} for node in ("orientation_estimator", "smoother")}
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["left_out"] == expected
+    assert find_left_out(bag, plan_pipeline(bag)) == (expected, [])
+    for live in (OrientationStream(), SmootherStream()):
+        for cdr in messages:
+            live.take({"imu/data_raw": [cdr]})
+        assert live.refused("imu/data_raw") == why
     with open_bag(bag) as reader:
         assert len(read_log(reader, "imu/data_raw")) == 399 and reader.damaged
     assert through("convert", bag, tmp_path / "copy").exit_code == 0    # its bytes as they are
+    assert run("report", bag, "--out", tmp_path / "r.html").exit_code == INCOMPLETE
 
 
 @pytest.mark.parametrize("log_time", [0, 1, 2**63, 2**64 - 1])
@@ -295,6 +324,21 @@ def test_log_times_at_the_ends_of_their_range(tmp_path, log_time):
     assert through("info", file, None).exit_code == 0
     assert through("convert", file, tmp_path / "out").exit_code == 0
     assert sorted(row[2] for row in rows_of(tmp_path / "out")[0]) == sorted([log_time, START])
+
+
+def test_log_times_below_zero_are_zero(tmp_path):
+    file = write_db3(tmp_path)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    before, _ = rows_of(file)
+    with sqlite3.connect(file) as database:
+        database.execute("update messages set timestamp = timestamp - ?", (START + STEP,))
+    result = through("info", file, None)
+    assert result.exit_code == 0 and "those below zero are read as zero" in result.output
+    assert through("convert", file, tmp_path / "out").exit_code == 0
+    after, _ = rows_of(tmp_path / "out")
+    assert after[0][2] == 0 and [row[3] for row in after] == [row[3] for row in before]
+    with open_bag(file) as reader:    # as the replayer asks for them
+        assert len(list(reader.messages(None, reader.start_time, reader.end_time))) == len(before)
 
 
 # rosbag2's metadata and compression.
@@ -346,7 +390,7 @@ def test_mutations_are_read_or_refused(tmp_path, kind):
     rng = random.Random(f"quick {kind}")
     assert outcome(read, file) == "read"
     for _ in range(40):
-        broken, done = mutated(data, rng, file.suffix in (".csv", ".yaml"))
+        broken, done = mutated(data, rng, file.suffix)
         file.write_bytes(broken)
         assert outcome(read, file) in ("read", "refused"), done
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from imu_fusion import cli
 from imu_fusion.errors import BagError
 from imu_fusion.messages.convert import fix_message, imu_message, pose_message
-from imu_fusion.messages.layouts import ODOMETRY
+from imu_fusion.messages.layouts import ACCEL, ODOMETRY
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.export import export
@@ -33,6 +33,8 @@ def bag(tmp_path):
                 stamp, "world", (0.0, 0.0, 0.0, 1.0), (k, 2.0, 3.0)), stamp)
             writer.write("/smoother/odometry", ODOMETRY.msgtype, ODOMETRY.encode(
                 stamp, "world", np.arange(ODOMETRY.size, dtype=float), "body"), stamp)
+            writer.write("/acceleration_field/accel", ACCEL.msgtype, ACCEL.encode(
+                stamp, "body", np.r_[1.0:7.0, np.diag(np.arange(6.0) ** 2).ravel()]), stamp)
             writer.write("/text", "std_msgs/msg/String", b"\0\1\0\0\2\0\0\0a\0", stamp)
     return tmp_path / "bag"
 
@@ -58,6 +60,12 @@ def test_rows_are_the_messages_and_the_header_names_units(bag, tmp_path):
     assert float(odometry[0]["position_z [m]"]) == 2.0
     assert float(odometry[0]["sd_position_y [m]"]) == pytest.approx(np.sqrt(7.0 + 7.0))
     assert float(odometry[0]["velocity_body_x [m/s]"]) == 43.0
+    (first, *_) = table(tmp_path / "out" / "acceleration_field_accel.csv")
+    assert [float(first[f"{name}_z [{unit}]"]) for name, unit in (
+        ("acceleration", "m/s^2"), ("sd_acceleration", "m/s^2"),
+        ("angular_acceleration", "rad/s^2"), ("sd_angular_acceleration", "rad/s^2"))] == [
+            3.0, 2.0, 6.0, 5.0]
+    assert first["sd_acceleration_x [m/s^2]"] == ""    # zero: unknown
 
 
 def test_trajectories_and_tracks_are_read_by_others(bag, tmp_path):

@@ -62,3 +62,26 @@ def test_bytes_that_are_not_the_message_are_told(tmp_path):
         writer.write("/imu", "sensor_msgs/msg/Imu", b"\x00\x01\x00\x00\x01\x02", START)
     (finding,) = inspect(tmp_path / "bag")["/imu"].findings
     assert finding.kind == "type" and finding.text.startswith("/imu")
+
+
+def test_a_long_recording_is_looked_at_in_stretches(tmp_path):
+    """Of a real flight what is counted is the same; what is found says where."""
+    whole = inspect(BAGS / "px4_plane")
+    with open_bag(BAGS / "px4_plane") as reader:
+        for row in inspect_topics(reader, 4000):
+            other = whole[row.topic]
+            assert (row.count, row.longest_gap) == (other.count, other.longest_gap)
+            assert row.rate == (other.rate and pytest.approx(other.rate))
+            assert (row.timing.repeated, row.timing.backwards) == (
+                other.timing.repeated, other.timing.backwards)
+            assert row.ranges == other.ranges
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(300):
+            stamp = START + i * 10_000_000
+            writer.write("/imu", "sensor_msgs/msg/Imu", imu_message(
+                stamp, "imu", [np.nan if i == 250 else 0.01 * i, 0, 0], [0, 0, 9.81]), stamp)
+    with open_bag(tmp_path / "bag") as reader:
+        (row,) = inspect_topics(reader, 100)
+    (text,) = (f.text for f in row.findings if f.kind == "nan")
+    assert text.endswith("(in 1 of 3 stretches of the recording, the first of them from stamp "
+                         f"{START + 200 * 10_000_000} on)")

@@ -1,9 +1,11 @@
 """The HTML report: self-contained, safe against what files contain, complete, bounded."""
 
+import base64
 import json
 import re
 import shutil
 import subprocess
+import zlib
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -113,7 +115,10 @@ def test_a_report_needs_nothing_from_outside(tmp_path):
     page = Page(out.read_text())
     assert [link for link in page.links if not link.startswith("#")] == []
     assert [t for t, _ in page.tags if t in ("link", "iframe", "object")] == []
-    assert "Plotly.newPlot" in out.read_text() and out.stat().st_size > 1e6
+    (packed,) = re.findall(r'id="plotly">([^<]*)<', out.read_text())
+    plotly = zlib.decompress(base64.b64decode(packed))
+    assert b"plotly.js" in plotly[:100] and b"scatter3d" in plotly and len(plotly) > 1e6
+    assert "Plotly.newPlot" in out.read_text() and out.stat().st_size < 1e6
 
 
 def test_all_blocks_are_shown_and_columns_of_numbers_set_to_the_right():
@@ -133,18 +138,28 @@ def test_a_report_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_the_report_of_a_real_recording_is_complete_and_bounded(tmp_path):
-    """Without orientation estimates it is about the recording and its trajectory."""
     out = tmp_path / "report.html"
-    write_recording_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    write_recording_report(BAGS / "px4_plane", None, out)
     page = Page(out.read_text())
-    assert "holds no estimates" in page.text and "/onboard_ekf/pose" in page.text
     assert "13656" in page.text and "136.55" in page.text and "214 gaps" in page.text
     headings = re.findall(r"<h2>(.*?)</h2>", out.read_text())
     assert headings == [
         "Summary", "The recording", "Trajectory", "Velocity", "Attitude of the trajectory",
-        "Sensor errors", "Before and after", "Innovations", "Angular rates and specific force",
-        "GNSS"]
-    assert out.stat().st_size < 8e6
+        "Sensor errors", "Before and after", "Innovations", "Orientation",
+        "Difference from onboard_ekf/pose", "Gyroscope bias", "Magnetic field",
+        "Angular rates and specific force", "GNSS"]
+    assert out.stat().st_size < 3e6
+
+
+def test_a_report_makes_nothing_where_estimates_are_given_and_says_what_these_lack(tmp_path):
+    out = tmp_path / "report.html"
+    write_recording_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    page = Page(out.read_text())
+    assert "px4_plane holds no estimates, but /fix, " in page.text
+    assert ("There is no smoothed trajectory: px4_plane holds no trajectory on smoother/odometry"
+            in page.text)
+    assert re.findall(r"<h2>(.*?)</h2>", out.read_text()) == [
+        "Summary", "The recording", "Angular rates and specific force", "GNSS"]
 
 
 def test_hours_of_data_give_a_page_of_bounded_size():
@@ -152,15 +167,15 @@ def test_hours_of_data_give_a_page_of_bounded_size():
     time = np.arange(n) * 0.0035
     lines = tuple(Line(f"s{i}", time, np.sin(time * (i + 1)), "#000000") for i in range(3))
     text = Figure(time_figure([Panel("y", lines)] * 3)).render()
-    # 9 lines x 3000 points x 2 x float32 in base64 are 288 kB.
-    assert len(text) < 300_000
+    # 9 lines x 2400 points x 2 x float32 in base64 are 230 kB.
+    assert len(text) < 230_000
 
 
 def test_time_axes_are_one_and_all_panels_are_labelled():
     line = Line("a", np.arange(5.0), np.arange(5.0), "#123456")
     figure = time_figure([Panel("u in V", (line,)), Panel("i in A", (line,))],
                          [Shade("on", ((1.0, 2.0),))])
-    assert figure.layout.xaxis.matches == figure.layout.xaxis2.matches == "x"
+    assert figure.layout.xaxis.matches is None and figure.layout.xaxis2.matches == "x"
     labels = {a.text for a in figure.layout.annotations}
     assert labels == {"u in V", "i in A"}
     assert "time" in figure.layout.xaxis2.title.text
@@ -284,7 +299,7 @@ def test_a_real_browser_draws_every_figure_offline(tmp_path):
     if browser is None:
         pytest.skip("no Chromium here")
     out = tmp_path / "report.html"
-    write_recording_report(BAGS / "px4_plane", BAGS / "px4_plane", out)
+    write_recording_report(BAGS / "px4_plane", None, out)
     drawn = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
          "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -292,7 +307,7 @@ def test_a_real_browser_draws_every_figure_offline(tmp_path):
          "--virtual-time-budget=20000", "--dump-dom", out.as_uri()],
         check=True, capture_output=True, text=True, timeout=120).stdout
     figures = len(Page(out.read_text()).figures)
-    assert figures == 11
+    assert figures == 16
     # plotly marks every element that it has drawn into, and puts one layer of axes there.
     assert len(re.findall(r'<div class="plot[^>]*js-plotly-plot', drawn)) == figures
     assert drawn.count('class="cartesianlayer"') == figures

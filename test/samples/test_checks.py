@@ -203,6 +203,19 @@ def test_no_fix_at_all_is_told():
     assert finding.kind == "fix" and "3 of 3" in finding.text
 
 
+@pytest.mark.parametrize("sd, told", [(35.0, True), (8.0, False), (0.0, False)])
+def test_fixes_of_a_telephone_network_are_told(sd, told):
+    n = 9
+    cov = np.tile(np.eye(3) * sd ** 2, (n, 1, 1))
+    cov[0] *= 400.0    # one that is still worse
+    log = FixLog(stamp=np.arange(n) * 10 ** 9, latitude_deg=np.full(n, 47.0),
+                 longitude_deg=np.full(n, 8.0), height=np.zeros(n), cov_enu=cov,
+                 status=np.zeros(n))
+    texts = [finding.text for finding in checks.check_fix(log)]
+    assert [("35 to 700 m, 35 m as a rule" in text and "gnss.position_error_sd" in text)
+            for text in texts] == [True] * told
+
+
 def test_fixes_without_a_fix_are_told():
     n = 6
     log = FixLog(stamp=np.arange(n) * 10 ** 9, latitude_deg=[47, 47, 0, 95, 47, np.nan],

@@ -150,6 +150,8 @@ def test_errors_of_an_export_name_file_line_and_column(tmp_path, files, words):
     (AVANODE_IMU.rsplit("#,", 1)[0] + "1,1,1,1,1,1,1,1,1,1,1\n", "no line '#date,factor acc"),
     (AVANODE_GNSS + "2,1,2022:13:22:7:51:37,3,11.38,47.31,0,1,2,3,0\n",
      "line 2, column 'utc': '2022:13:22:7:51:37'"),
+    (AVANODE_GNSS + f"2,1,{9 * 10**30}:1:22:7:51:37,3,11.38,47.31,0,1,2,3,0\n",
+     "is not a date"),
     (AVANODE_GNSS.replace("height[mm]", "h[mm]") + "2,1,2022:1:22:7:51:37,3,1,4,0,1,2,3,0\n",
      "column 'height' is in 'm', expected mm"),
 ])

@@ -18,7 +18,7 @@ from imu_fusion.sources.phyphox import PhyphoxExport, PhyphoxLive
 from imu_fusion.sources.sensor_logger import SensorLoggerExport, SensorLoggerPush
 from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
 from imu_fusion.sources.ximu3 import Ximu3
-from test.sources.logs import read, same, together
+from test.sources.logs import read, same, together, ulog
 from test.sources.test_splitting import escaped, nmea, solution
 
 
@@ -317,6 +317,23 @@ def test_a_ulog_that_is_cut_ends(tmp_path):
     (tmp_path / "cut.ulg").write_bytes(header + b"\xff\xff\x00" + bytes(300))
     with pytest.raises(ImuFusionError, match=r"cut\.ulg"):
         open_bag(tmp_path / "cut.ulg")
+
+
+def test_a_ulog_without_a_field_says_which(tmp_path):
+    (tmp_path / "log.ulg").write_bytes(ulog().replace(b"float[3] gyro_rad;", b"float[3] gyro_rat;"))
+    with pytest.raises(ImuFusionError, match=r"log\.ulg: .*there is no 'gyro_rad\[0\]'"):
+        open_bag(tmp_path / "log.ulg")
+
+
+def test_samples_whose_stamps_no_message_can_hold_are_left_out_and_counted(tmp_path):
+    """builtin_interfaces/Time ends in 2038."""
+    point = '<trkpt lat="47.0" lon="8.5"><ele>400</ele><time>%s-01-02T03:04:0%dZ</time></trkpt>'
+    years = ["2026", "2026", "2039", "1969", "2261"]
+    (tmp_path / "track.gpx").write_text("<gpx><trk><trkseg>" + "".join(
+        point % (year, k) for k, year in enumerate(years)) + "</trkseg></trk></gpx>")
+    with open_bag(tmp_path / "track.gpx") as reader:
+        assert len(read_log(reader, "fix")) == 2 and reader.damaged
+        assert "3 samples stamped before 1970 or after 2038" in reader.warnings[0]
 
 
 def test_an_archive_that_unpacks_without_end_is_refused(tmp_path):

@@ -95,6 +95,16 @@ def test_no_bytes_stop_a_stream(make, pieces, part):
     source.finish()
 
 
+@pytest.mark.parametrize("make, part, data", [
+    (PhyphoxLive, "/time", b'[{"event": "START", "experimentTime": 0, "systemTime": 1e999}]'),
+    (PhyphoxLive, "/time", b'[{"event": "START", "experimentTime": 1e300, "systemTime": 2e9}]'),
+    (SensorLoggerPush, "", b'{"messageId": Infinity, "sessionId": "s", "payload": []}'),
+    (SensorLoggerPush, "", b'{"messageId": %s, "sessionId": "s", "payload": []}' % (b"9" * 400))])
+def test_numbers_beyond_all_bounds_are_counted_and_stop_no_stream(make, part, data):
+    source = make()
+    assert not source.feed(data, part) and sum(source.lost.values()) == 1 and not source.finish()
+
+
 @settings(max_examples=60, deadline=None)
 @given(name=st.sampled_from(sorted(STREAMS)), data=st.data())
 def test_damage_is_an_error_of_the_user_or_counted(name, data):

@@ -5,7 +5,17 @@ import pytest
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.orientation.params import OrientationParams
-from imu_fusion.streams.orientation import MAG_TOPIC, OrientationStream
+from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.messages.layouts import IMU, NANOSECONDS
+from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE
+from imu_fusion.messages.typestore import TYPES
+from imu_fusion.streams.orientation import (
+    IMU_TOPIC,
+    MAG_TOPIC,
+    ORIENTATION_TOPIC,
+    OrientationOutputParams,
+    OrientationStream,
+)
 
 
 @pytest.mark.parametrize("values", [{}, {"method": "gyro_mag"},
@@ -23,6 +33,28 @@ def test_a_calibration_is_taken_over_by_every_method(values):
     assert params.sensor.mag_offset == tuple(found.offset)
     assert params.method == stream.params.method and params.is_as_printed == (
         "gyro_mag.as_printed" in values)
+
+
+def test_transforms_are_the_published_orientations_from_the_fixed_frame():
+    """Also turned by set_heading."""
+    output = OrientationOutputParams(publish_tf=True, fixed_frame="map")
+    stream = OrientationStream(output=output)
+    stamps = range(0, 4 * NANOSECONDS, 10_000_000)
+    messages = {IMU_TOPIC: [imu_message(s, "ball", (0, 0, 0), (0, 1, 9.7)) for s in stamps],
+                MAG_TOPIC: [mag_message(s, "ball", (0, 2e-5, -4e-5)) for s in stamps]}
+    made = stream.take({topic: cdrs[:300] for topic, cdrs in messages.items()})
+    stream.set_heading(1.0)
+    made += stream.take({topic: cdrs[300:] for topic, cdrs in messages.items()})
+    imu, tf = ([cdr for part in made if part.topic == topic for cdr in part.cdrs]
+               for topic in (ORIENTATION_TOPIC, TF_TOPIC))
+    assert len(imu) == len(tf) == 400
+    for cdr, transform in zip(imu, tf):
+        stamp, frame_id, values = IMU.decode(cdr)
+        (found,) = TYPES.deserialize_cdr(transform, TF_TYPE).transforms
+        assert (found.header.frame_id, found.child_frame_id) == ("map", frame_id)
+        assert found.header.stamp.sec * NANOSECONDS + found.header.stamp.nanosec == stamp
+        turn = found.transform.rotation
+        assert [turn.x, turn.y, turn.z, turn.w] == values[IMU["orientation"]].tolist()
 
 
 def test_there_is_no_heading_to_set_before_the_first_row():

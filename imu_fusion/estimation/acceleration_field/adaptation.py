@@ -2,10 +2,11 @@
 
 Where they are larger than they should be, sample after sample, something is. Noise, as far as the
 accelerometers do not agree on one rigid motion, or if innovations change their signs (Mehra 1970):
-jitter of the clock, flexing, ringing. Else the motion is wilder than its densities. That is then
-taken to be larger, by no more than was seen, until the innovations fit again: estimates weigh
-rightly what they have, and say how sure they are. Of data that fit nothing changes at all: the
-excess is summed (Page 1954), and has to be more than chance makes it.
+jitter of the clock, flexing, ringing. Else the motion is wilder than its densities: see
+:mod:`.motion_watch`. That is then taken to be larger, by no more than was seen, until the
+innovations fit again: estimates weigh rightly what they have, and say how sure they are. Of data
+that fit nothing changes at all: the excess is summed (Page 1954), and has to be more than chance
+makes it.
 """
 
 import math
@@ -16,11 +17,12 @@ from imu_fusion.kernels import njit
 
 #: ``noise`` and ``motion``: summed excess of the squares of either kind; ``product`` and ``square``
 #: of innovations with those of the sample before, fading; ``grace``: samples for which nothing is
-#: judged yet; ``samples`` in which something was taken
-#: to be larger, and how much the ``most`` was, as a factor on standard deviations, of each kind.
+#: judged yet; ``samples`` in which something was taken to be larger, and how much the ``most`` was,
+#: as a factor on standard deviations, of each kind; ``tracked``: see :mod:`.motion_watch`.
 ADAPTATION = np.dtype([
     ("noise", "f8"), ("motion", "f8"), ("product", "f8"), ("square", "f8"),
-    ("grace", "i8"), ("samples", "i8", 2), ("most", "f8", 2)], align=True)
+    ("grace", "i8"), ("samples", "i8", 2), ("most", "f8", 2), ("tracked", "f8", (6, 5))],
+    align=True)
 
 _EXPECTED = 1.5     # mean square of a channel's innovation that is no excess, in its variances
 _CHANCE = 6.0       # summed excess of twelve channels that chance makes once in many days
@@ -37,22 +39,37 @@ def factor(excess):
 
 
 @njit
-def _summed(total, squares):
-    """The summed excess with the mean ``squares`` of one more sample; what was large goes the
-    faster, and what comes makes the variance no larger than they are."""
+def summed(total, squares, largest):
+    """The summed excess with the mean ``squares`` of one more sample. What was large goes the
+    faster; what comes makes a variance no more than ``largest`` times larger, as was seen."""
     excess = squares - _EXPECTED
     if excess < 0.0:
         return max(total + excess * max(1.0, total / _SLOWNESS), 0.0)
-    seen = _CHANCE + _SLOWNESS * math.log(squares * factor(total))
-    return max(total, min(total + excess, seen))
+    return max(total, min(total + excess, _CHANCE + _SLOWNESS * math.log(max(largest, 1.0))))
 
 
 @njit
-def adapt(adaptation, squares, contradiction, innovation, last):
+def alternates(adaptation, times):
+    """Whether innovations change their signs, so many ``times`` as clearly as noise does."""
+    return bool(adaptation.product < times * _ALTERNATING * adaptation.square)
+
+
+@njit
+def note(adaptation, kind, excess):
+    """Keep for the remarks how much kind 0, noise, or 1, motion, is taken to be larger."""
+    grown = factor(excess)
+    if adaptation.grace == 0 and grown > 1.0:
+        adaptation.samples[kind] += 1
+        adaptation.most[kind] = max(adaptation.most[kind], math.sqrt(grown))
+
+
+@njit
+def adapt(adaptation, squares, contradiction, watched, innovation, last):
     """Take one sample.
 
     Args:
         adaptation: ADAPTATION, changed.
+        watched: whether it was enough for the motion to be watched; else its innovations tell.
         squares: mean of the squares of its innovations, in units of their variances.
         contradiction: mean square of what no rigid motion explains, in units of the noise of the
             parameters.
@@ -68,11 +85,12 @@ def adapt(adaptation, squares, contradiction, innovation, last):
     if adaptation.grace > 0:
         adaptation.grace -= 1
         return
-    noise = min(squares, contradiction / factor(adaptation.noise))
-    if adaptation.product < _ALTERNATING * adaptation.square:
-        noise = squares
-    adaptation.noise = _summed(adaptation.noise, noise)
-    adaptation.motion = _summed(adaptation.motion, squares / max(noise, 1.0))
-    for i, grown in enumerate((factor(adaptation.noise), factor(adaptation.motion))):
-        adaptation.samples[i] += grown > 1.0
-        adaptation.most[i] = max(adaptation.most[i], math.sqrt(grown))
+    noise = squares
+    if not alternates(adaptation, 1.0):
+        noise = min(squares, contradiction / factor(adaptation.noise))
+    adaptation.noise = summed(adaptation.noise, noise, noise * factor(adaptation.noise))
+    if not watched:
+        motion = squares / max(noise, 1.0)
+        adaptation.motion = summed(adaptation.motion, motion, motion * factor(adaptation.motion))
+        note(adaptation, 1, adaptation.motion)
+    note(adaptation, 0, adaptation.noise)

@@ -15,6 +15,7 @@ import numpy as np
 from imu_fusion.estimation.acceleration_field.measurement import (
     TOUCHED,
     innovation_of,
+    linearise,
     noise_variance,
 )
 from imu_fusion.estimation.acceleration_field.motion_model import ACC, ALPHA, OMEGA
@@ -40,6 +41,7 @@ _PROOF = 10.0       # samples left out that make an accelerometer faulty
 _MOST = 50.0        # beyond which evidence does not grow
 _SCALE = 1e-3       # of what it feels: no accelerometer is truer
 _SHARE = 1e-3       # of a channel's reading that must be left over for a check of it
+_FAR_BETTER = 10.0  # times smaller variances of a and alpha
 _FORGET = 0.1       # of a sample's evidence, by one in which a moving sensor agrees
 
 
@@ -157,8 +159,9 @@ def cross_check(state, p, channels, reading, at, work):
             work.innovation[c] = innovation_of(
                 reading[c], work.expected[c], work.entries[c], work.touched[c], work.row[c],
                 state.x, at)
-    if work.fit.redundancy[0] > 0:
+    if work.fit.redundancy[0] >= 0:
         _allow(state, p, channels, reading, work)
+    if work.fit.redundancy[0] > 0:
         worst = _worst(work.fit, work)
         while worst > _GATE * _GATE and _leave_out(state, channels, work, worst, p):
             worst = _worst(work.fit, work)
@@ -169,33 +172,6 @@ def cross_check(state, p, channels, reading, at, work):
         work.doubt[c] = doubt * work.variance[c]
         work.use[c] = math.isfinite(reading[c]) and (channels[c].is_gyro or work.fit.used[c]
                                                      or work.fit.redundancy[0] < 0)
-
-
-@njit
-def open_motion(state, p, channels, work, dt):
-    """Where all accelerometers agree that a or alpha has changed by more than the prediction
-    allows, as when a hard impact begins, let them: else the filter would blame biases and mounting.
-    The covariance of the State is changed; dt: s since the sample before."""
-    fit = work.fit
-    if fit.redundancy[0] < 0:
-        return
-    for i in range(6):
-        change, allowed = 0.0, 0.0
-        for c in range(len(work.innovation)):
-            change += fit.solve[i, c] * work.innovation[c]
-            # Of the noise alone: what mounting does may as well be let go with the motion.
-            allowed += (fit.solve[i, c] * fit.solve[i, c]
-                        * noise_variance(channels[c], p))
-        at, unit = (ACC + i, 1.0) if i < 3 else (ALPHA + i - 3, p.radius)
-        if change * change > _GATE * _GATE * (allowed + unit * unit * state.cov[at, at]):
-            jump = change * change / (unit * unit)
-            state.cov[at, at] += jump
-            if i >= 3:
-                # At any time of the step: so much of it is in the angular velocity.
-                omega = OMEGA + i - 3
-                state.cov[omega, omega] += dt * dt / 3.0 * jump
-                state.cov[omega, at] += 0.5 * dt * jump
-                state.cov[at, omega] += 0.5 * dt * jump
 
 
 @njit
@@ -212,16 +188,32 @@ def contradiction(p, channels, work):
 
 
 @njit
-def doubt_second_order(state, channels, work):
-    """Add to ``work.doubt`` products of two errors, which no linearisation sees: of the mounting
-    and of what it multiplies, and of the angular velocity with itself. They count at the start and
-    after gaps, where readings are linearised at predictions."""
-    cov = state.cov
-    spin, turning, force = 0.0, 0.0, 0.0
+def linearise_well(state, p, channels, at, work):
+    """Linearise again at what the fit of the sample makes of a and alpha, where it is far better
+    than the prediction, where ``at`` (N,) is: when an impact begins. Elsewhere its errors, which
+    are those of the innovations, would bias the mounting. Then add to ``work.doubt`` products of
+    two errors, which no linearisation sees: of the mounting and of what it multiplies, and of the
+    angular velocity with itself."""
+    cov, fit = state.cov, work.fit
+    spin, force, turning = 0.0, 0.0, 0.0
     for i in range(3):
         spin += cov[OMEGA + i, OMEGA + i]
-        turning += cov[ALPHA + i, ALPHA + i]
         force += cov[ACC + i, ACC + i]
+        turning += cov[ALPHA + i, ALPHA + i]
+    if fit.redundancy[0] >= 0:
+        by_fit = np.zeros(6)
+        for i in range(6):
+            for c in range(len(channels)):
+                by_fit[i] += fit.solve[i, c] * fit.solve[i, c] * work.variance[c]
+        felt = by_fit[0] + by_fit[1] + by_fit[2]
+        turned = by_fit[3] + by_fit[4] + by_fit[5]
+        if _FAR_BETTER * (felt + turned) < force + p.radius * p.radius * turning:
+            force, turning = felt, turned / (p.radius * p.radius)
+            for i in range(3):
+                for c in range(len(channels)):
+                    at[ACC + i] += fit.solve[i, c] * work.innovation[c]
+                    at[ALPHA + i] += fit.solve[3 + i, c] * work.innovation[c] / p.radius
+            linearise(channels, at, work)
     for c in range(len(channels)):
         channel = channels[c]
         turned, shifted = 0.0, 0.0

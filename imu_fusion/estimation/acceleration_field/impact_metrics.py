@@ -20,6 +20,14 @@ STANDARD_GRAVITY = 9.80665
 CHANNEL_CLASSES = (60, 180, 600, 1000)
 # From x forward, y left, z up (REP 103) to the axes of SAE J211.
 J211_FROM_REP103 = np.diag([1.0, -1.0, -1.0])
+UNITS = {
+    "begin_s": "s", "stamp": "ns", "point": "m", "hic15": "g^2.5 s", "hic15_interval_s": "s",
+    "hic36": "g^2.5 s", "hic36_interval_s": "s", "bric": "1", "gambit": "1", "damage": "1",
+    **dict.fromkeys(("peak_linear_acceleration", "peak_linear_acceleration_xyz", "clip_3ms",
+                     "clip_3ms_cumulative"), "m/s^2"),
+    "peak_velocity_change": "m/s", "peak_angular_velocity": "rad/s",
+    "peak_angular_acceleration": "rad/s^2"}
+"""Units of what :func:`measure_impacts` and :func:`find_peaks` return."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,23 @@ class ImpactParams(Parameters):
             "axes apart (BrIC, DAMAGE) need it.")
 
 
+def corner_frequency(channel_class: int, rate: float) -> float:
+    """Hz, of a channel frequency class of SAE J211-1 at a rate in Hz.
+
+    Raises:
+        SampleError: a class that there is not, or a rate too low for it.
+    """
+    if channel_class not in CHANNEL_CLASSES:
+        raise SampleError(f"channel class {channel_class}: there are CFC "
+                          + ", ".join(map(str, CHANNEL_CLASSES)))
+    corner = 2.0775 * channel_class
+    if corner >= 0.45 * rate:
+        raise SampleError(f"CFC {channel_class} has its corner at {corner:.0f} Hz: a rate of "
+                          f"{rate:g} Hz is too low, use a lower class or none (SAE J211 asks for "
+                          f"{10 * channel_class} Hz)")
+    return corner
+
+
 def channel_filter(values: ArrayLike, rate: float, channel_class: int) -> np.ndarray:
     """Zero-phase filter of a channel frequency class, SAE J211-1 appendix C.
 
@@ -63,14 +88,7 @@ def channel_filter(values: ArrayLike, rate: float, channel_class: int) -> np.nda
     Raises:
         SampleError: a class that there is not, or a rate too low for it.
     """
-    if channel_class not in CHANNEL_CLASSES:
-        raise SampleError(f"channel class {channel_class}: there are CFC "
-                          + ", ".join(map(str, CHANNEL_CLASSES)))
-    corner = 2.0775 * channel_class
-    if corner >= 0.45 * rate:
-        raise SampleError(f"CFC {channel_class} has its corner at {corner:.0f} Hz: a rate of "
-                          f"{rate:g} Hz is too low, use a lower class or none (SAE J211 asks for "
-                          f"{10 * channel_class} Hz)")
+    corner = corner_frequency(channel_class, rate)
     values = np.asarray(values, dtype=float)
     pad = min(len(values) - 1, max(6, int(np.ceil(0.01 * rate))))
     sections = scipy.signal.butter(2, corner, fs=rate, output="sos")
@@ -254,6 +272,25 @@ def measure_impacts(rows: np.ndarray, points: ArrayLike, gravity: float,
                 "missing_samples": int(np.sum(rows["flags"][event] & (MISSING | GAP) > 0)),
                 "axes": "j211"})
     return results
+
+
+def find_peaks(rows: np.ndarray, points: ArrayLike, gravity: float) -> dict[str, Any]:
+    """The greatest magnitudes over rows of an estimator, impact or none, unfiltered.
+
+    Args:
+        rows, points, gravity: as of :func:`measure_impacts`; at least one row.
+
+    Returns:
+        dict of plain numbers: of the linear acceleration one for each point, with its stamp.
+    """
+    points = np.asarray(points, dtype=float).reshape(-1, 3)
+    points = points if len(points) else np.zeros((1, 3))
+    magnitude = np.linalg.norm(field_at(rows, points, gravity)[1], axis=2)
+    at = magnitude.argmax(axis=0)
+    return {"point": points.tolist(), "peak_linear_acceleration": magnitude.max(axis=0).tolist(),
+            "stamp": rows["stamp"][at].tolist(),
+            "peak_angular_velocity": float(np.linalg.norm(rows["omega"], axis=1).max()),
+            "peak_angular_acceleration": float(np.linalg.norm(rows["alpha"], axis=1).max())}
 
 
 def _metrics(t, acc, omega, alpha):

@@ -162,12 +162,12 @@ def scalar_update(x, cov, index, h, count, innovation, variance, column):
     total = variance
     for k in range(count):
         total += h[k] * column[index[k]]
+    inverse = 1.0 / total
     for i in range(n):
-        gain = column[i] / total
-        row = cov[i]
-        x[i] += gain * innovation
-        for j in range(n):
-            row[j] -= gain * column[j]
+        moved, row = column[i], cov[i]
+        x[i] += moved * inverse * innovation
+        for j in range(n):    # in this order it stays symmetric to the last bit
+            row[j] -= moved * column[j] * inverse
     return total
 
 

@@ -57,6 +57,7 @@ class State(NamedTuple):
     checks: np.ndarray   # (K,) CHECK of the accelerometers, see cross_check
     adaptation: np.ndarray   # (1,) ADAPTATION
     innovation: np.ndarray   # (m,) of the last sample, before it was used
+    fitted: np.ndarray   # (m,) bool, channels whose fit is followed, see motion_watch
 
 
 class Step(NamedTuple):
@@ -213,8 +214,10 @@ def predict(state, p, channels, step):
     half = np.ascontiguousarray(cov[:BIAS, :BIAS].T)
     multiply_transition(half, f)
     put_symmetric(cov, half)
-    wildness = factor(state.adaptation[0].motion)
-    _add_noise(cov, p, channels, step, wildness)
+    add_motion_noise(cov, p, step, factor(state.adaptation[0].motion))
+    for c in range(len(channels)):
+        walk = channels[c].bias_walk
+        cov[BIAS + c, BIAS + c] += walk * walk * dt
     return phi
 
 
@@ -233,9 +236,9 @@ def put_symmetric(cov, moving):
 
 
 @njit
-def _add_noise(cov, p, channels, step, wildness):
-    """Add what the Step's white noises do to the covariance, in place; wildness: factor on the
-    variances of the motion."""
+def add_motion_noise(cov, p, step, wildness):
+    """Add what the white noises of the motion do in a Step to the covariance, ``wildness`` times,
+    in place."""
     dt = step.dt[0]
     jerk = wildness * p.motion.jerk_density * p.motion.jerk_density
     q = wildness * p.motion.acceleration_rate_density * p.motion.acceleration_rate_density
@@ -247,9 +250,6 @@ def _add_noise(cov, p, channels, step, wildness):
         cov[ACC + i, ACC_RATE + i] += 0.5 * q * dt * dt
         cov[ACC_RATE + i, ACC + i] += 0.5 * q * dt * dt
         cov[ACC_RATE + i, ACC_RATE + i] += q * dt
-    for c in range(len(channels)):
-        walk = channels[c].bias_walk
-        cov[BIAS + c, BIAS + c] += walk * walk * dt
 
 
 @njit

@@ -9,9 +9,8 @@ from imu_fusion.estimation.acceleration_field.cross_check import (
     CHECK,
     contradiction,
     cross_check,
-    doubt_second_order,
+    linearise_well,
     make_workspace,
-    open_motion,
 )
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
@@ -31,6 +30,7 @@ from imu_fusion.estimation.acceleration_field.motion_model import (
     predict,
     reopen,
 )
+from imu_fusion.estimation.acceleration_field.motion_watch import watch_motion
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_row, rigid_gradient
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
@@ -56,6 +56,7 @@ def _predict_to(stamp, state, p, channels, step, trace, n):
         dt = (stamp - state.last[0]) * 1e-9
         if dt > p.gap.max:
             flags = GAP
+            step.dt[0] = -1.0
             state.adaptation[0].grace = GRACE
             reopen(state.x, state.cov, dt, p.spread)
             trace.phi[n] = 0.0
@@ -78,19 +79,19 @@ def _fold(state):
 
 
 @njit
-def _correct(state, p, channels, reading, at, is_predicted, work, trace, n):
+def _correct(state, p, channels, reading, at, is_predicted, step, work, trace, n):
     """Correct the State by a sample, linearised at the state ``at`` (N,), which may be that
     predicted, in place; the other arguments and what is returned are those of :func:`update`."""
     linearise(channels, at, work)
     cross_check(state, p, channels, reading, at, work)
     if p.is_adaptive:
-        open_motion(state, p, channels, work, max(trace.dt[n], 0.0))
+        watch_motion(state, p, channels, reading, step, work)
     if is_predicted:
-        doubt_second_order(state, channels, work)
+        linearise_well(state, p, channels, at, work)
     found = update(state, p, channels, reading, at, work, trace, n)
     if found.used > 0 and p.is_adaptive:
-        adapt(state.adaptation[0], found.squares / found.used,
-              contradiction(p, channels, work), work.innovation, state.innovation)
+        adapt(state.adaptation[0], found.squares / found.used, contradiction(p, channels, work),
+              work.fit.redundancy[0] >= 0, work.innovation, state.innovation)
     return found
 
 
@@ -108,7 +109,7 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
     for n in range(len(stamp)):
         flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
         at[:] = state.x
-        found = _correct(state, p, channels, readings[n], at, True, work, trace, only)
+        found = _correct(state, p, channels, readings[n], at, True, step, work, trace, only)
         _fold(state)
         flags |= found.flags
         residual = math.nan
@@ -140,8 +141,8 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
         predicted = len(at) == 0
         where[:] = state.x if predicted else at[n]
-        likelihood += _correct(state, p, channels, readings[n], where, predicted, work, trace,
-                               n).log_likelihood
+        likelihood += _correct(state, p, channels, readings[n], where, predicted, step, work,
+                               trace, n).log_likelihood
         trace.x[n] = state.x
         trace.cov[n] = state.cov
         _fold(state)
@@ -164,7 +165,8 @@ class RigidBodyFilter:
         linearise(array.channels, start.x, self._work)
         self.state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
                            np.array([-1], dtype=np.int64), np.zeros(array.accelerometers, CHECK),
-                           np.zeros(1, ADAPTATION), np.zeros(len(array.channels)))
+                           np.zeros(1, ADAPTATION), np.zeros(len(array.channels)),
+                           np.zeros(len(array.channels), bool))
         self.state.adaptation["grace"] = GRACE
 
     def get_state(self) -> State:

@@ -14,6 +14,7 @@ _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave o
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
 _WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
+_MOSTLY = 0.5       # of the samples: an impact is wilder than what is before and after it
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ def fit_remarks(fits: list[SensorFit], state: State) -> list[str]:
             f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
             f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
             "jitter of the stamps, flexing, ringing or clipping, or raise noise_scale")
-    if motion > _WIDER:
+    if motion > _WIDER and adaptation["samples"][1] > _MOSTLY * state.checks["checked"].max():
         remarks.append(
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "

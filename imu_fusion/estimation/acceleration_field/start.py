@@ -104,7 +104,7 @@ def _agreeing(params, array, start, mean):
     work = make_workspace(array.channels)
     state = State(start.x, start.cov, start.quat, np.array([-1], dtype=np.int64),
                   np.zeros(array.accelerometers, CHECK), np.zeros(1, ADAPTATION),
-                  np.zeros(len(array.channels)))
+                  np.zeros(len(array.channels)), np.zeros(len(array.channels), bool))
     linearise(array.channels, start.x, work)
     cross_check(state, kernel_params(params, array)[0], array.channels, mean, start.x, work)
     return work.use

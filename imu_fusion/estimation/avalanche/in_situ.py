@@ -24,6 +24,7 @@ MODELS = {1: 9, 2: 12, 3: 15}
 LEVELS = ("position", "velocity")
 
 _ITERATIONS = 20
+_HALVINGS = 8
 _TOLERANCE = 1e-9
 _DIFFERENCE = 1e-6       # of a parameter, for the turn of the first attitude
 
@@ -123,13 +124,32 @@ def calibrate_in_situ(samples: BallSamples, constraint: Constraint,
     if realign is not None and constraint.rest_force is None:
         raise CalibrationError("in situ calibration: to realign it needs the force at rest")
     p = np.zeros(count)
+    rows, residual, plain = _system(samples, constraint, p, realign)
     for _ in range(_ITERATIONS if realign is not None else 1):
-        rows, residual, plain = _system(samples, constraint, p, realign)
         step = np.linalg.lstsq(rows, -residual, rcond=None)[0]
-        p = p + step
+        p, system = _descend(samples, constraint, p, step, realign, residual)
+        if system is None:
+            break
+        if realign is not None:
+            rows, residual, plain = system
         if np.abs(step).max() < _TOLERANCE:
             break
     return _result(samples, constraint, p, realign, rows, plain)
+
+
+def _descend(samples, constraint, p, step, realign, residual):
+    """Parameters after a step, and their system; the step is halved until the sum of squares falls.
+
+    Turned attitudes make the system nonlinear: full steps can run away from a ball whose attitudes
+    are wrong. Without ``realign`` it is linear, and a step is right. (p, None): no step helps.
+    """
+    before = np.sum(residual ** 2)
+    for _ in range(_HALVINGS):
+        system = _system(samples, constraint, p + step, realign)
+        if realign is None or np.sum(system[1] ** 2) < before:
+            return p + step, system
+        step = 0.5 * step
+    return p, None
 
 
 def _unpack(p, model, gravity):

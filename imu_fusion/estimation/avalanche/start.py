@@ -72,10 +72,10 @@ def find_motion(imu: ImuLog) -> MotionSpan:
     away = _away(imu, level, slice(quiet_until, stop), 3)
     start = quiet_until + int(np.argmax(away)) if away.any() else stop
     if which + 1 < len(rests):
-        # What is quiet can still be coming to rest.
+        # What is quiet can still be coming to rest, ever more slowly: a longer mean tells when.
         begin, end = rests[which + 1]
         slow = np.flatnonzero(_away(imu, slice((begin + end) // 2, end), slice(begin, end),
-                                    width // 2))
+                                    3 * width // 2))
         stop = begin + int(slow[-1]) + 1 if len(slow) else begin
     return MotionSpan(level.start, start, stop, imu.gyr[level].mean(axis=0),
                       imu.acc[level].mean(axis=0))

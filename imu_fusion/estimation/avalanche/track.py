@@ -24,6 +24,7 @@ from imu_fusion.sensors.magnetometer_calibration import MagCalibration, calibrat
 from imu_fusion.sensors.saturation import BAND, recover_rates, saturated_axes
 from imu_fusion.surfaces.constraint import Surface
 
+_FASTEST = 100.0   # rad/s: no ball turns faster
 _GAP = 3.0   # usual steps: a longer one cannot be integrated over
 
 
@@ -92,6 +93,15 @@ def _at(mag, stamp):
     return np.column_stack([np.interp(at, since, mag.mag[:, i]) for i in range(3)])
 
 
+def _bridged(stamp, rate):
+    """Rates (n, 3) with those that (B.3) cannot tell, a missing axis along the field, on straight
+    lines between their neighbours."""
+    since = seconds(stamp, stamp[0])
+    known = np.isfinite(rate) & (np.abs(rate) < _FASTEST)
+    return np.column_stack([np.interp(since, since[known[:, i]], rate[known[:, i], i])
+                            for i in range(3)])
+
+
 def attitudes(imu: ImuLog, rate: np.ndarray, mag: MagLog, alignment: float, declination_deg: float
               ) -> np.ndarray:
     """Attitudes (n, 4) by eqs. (5)-(14) from recovered rates (n, 3) and a calibrated field; the
@@ -145,6 +155,7 @@ def track_ball(imu: ImuLog, mag: MagLog, surface: Surface, field_world: np.ndarr
     near = slice(first, stop)
     rate, _ = recover_rates(imu.stamp[near], imu.gyr[near] - span.gyr_bias,
                             _at(mag, imu.stamp[near]), clipped(imu.gyr, params.gyro_range)[near])
+    rate = _bridged(imu.stamp[near], rate)
     quat = attitudes(imu[near], rate, mag.between(int(imu.stamp[first]), int(imu.stamp[stop - 1])
                                                   + 1), params.alignment,
                      math.degrees(math.atan2(field_world[0], field_world[1])))

@@ -121,12 +121,13 @@ def _backward(tapes, before, final, par, rows, first, adjoint, information):
         predicted = es.move_error(tape.prediction, error) + pushed
         span = max(tape.stamp - before_stamp, 1)
         while row >= begun:
+            dt = (rows[row].stamp - rows[max(row, 1) - 1].stamp) * 1e-9
             if rows[row].stamp == tape.stamp:
-                _correct_row(rows[row], p, after, cov_after, final[0], limits)
+                _correct_row(rows[row], p, after, cov_after, final[0], limits, dt)
             else:
                 part = (rows[row].stamp - before_stamp) / span
                 _correct_row(rows[row], p, (1.0 - part) * error + part * predicted,
-                             (1.0 - part) * cov_before + part * cov_after, final[0], limits)
+                             (1.0 - part) * cov_before + part * cov_after, final[0], limits, dt)
             row -= 1
         after, cov_after = error, cov_before
 
@@ -163,9 +164,9 @@ def _smoothed_cov(cov, information):
 
 
 @njit
-def _correct_row(row, p, error, cov, final, limits):
+def _correct_row(row, p, error, cov, final, limits, dt):
     """Apply the error (N,) and its covariance (12, 12) to one output row. final: the state at the
-    recording's end."""
+    recording's end; dt: s, the step before the row."""
     frame = p.frame_from_enu
     back = quat_conjugate(frame)
     turn = quat_exp(error, 1.0)
@@ -191,4 +192,4 @@ def _correct_row(row, p, error, cov, final, limits):
     cov_world = cov[:3, :3].copy()    # other rows share cov
     wander.widen(cov_world, final.wander.overall)
     cov_world[2, 2] += final.heading_var
-    write_cov_attitude(row, p, cov_world, quat_to_matrix(quat))
+    write_cov_attitude(row, p, cov_world, quat_to_matrix(quat), dt)

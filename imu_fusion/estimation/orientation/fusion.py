@@ -15,10 +15,10 @@ import numpy as np
 from imu_fusion.estimation.orientation import (
     clipped_rate,
     gyro_limit,
-    gyro_spike,
     imu_rejection,
     mag_queue,
     rotation_history,
+    spike,
     wander,
 )
 from imu_fusion.estimation.orientation import error_state as es
@@ -124,7 +124,7 @@ def step(s, p, stamp, sample, row, tape):
         s.clipped &= ~s.step.back
     for i in range(3):
         s.gyr_last[i] = s.step.gyr[i]
-        s.acc_last[i] = s.step.acc[i]
+        s.force_last[i] = s.step.force[i]
     _write(s, p, row, len(tape) > 0)
     return result
 
@@ -136,11 +136,11 @@ def _begin_step(s, p, stamp, sample):
     first = not s.started
     for i in range(3):
         step.gyr[i] = sample[i]
-        step.acc[i] = sample[3 + i]
-        step.missed[i] = 0.0
+        step.acc[i] = step.force[i] = sample[3 + i]
+        step.missed[i] = step.missed_force[i] = 0.0
         if first:
             s.gyr_last[i] = step.gyr[i]
-            s.acc_last[i] = s.rest.mean_force[i] = step.acc[i]
+            s.force_last[i] = s.rest.mean_force[i] = step.acc[i]
     if first:
         s.rest.since = s.stamp = stamp
         s.started = True
@@ -152,10 +152,15 @@ def _begin_step(s, p, stamp, sample):
     if clipped:
         step.flags |= FLAG_SATURATED | clipped << SATURATED_AXES_SHIFT
         s.counts.saturated += 1
-    if not first and gyro_spike.hold(s):
+    if spike.hold(s.gyro_spike, step.gyr[:], s.gyr_last[:], step.dt, spike.WILD_RATE,
+                  step.missed[:]):
         step.flags |= FLAG_HELD
         s.counts.rates_held += 1
         clipped = s.clipped     # nothing is known of this sample
+    if p.use_acc and spike.hold(s.acc_spike, step.force[:], s.force_last[:], step.dt,
+                                spike.WILD_FORCE, step.missed_force[:]):
+        step.flags |= FLAG_HELD
+        s.counts.forces_held += 1
     step.clipped = clipped
     step.begun = clipped & ~s.clipped
     step.back = s.clipped & ~clipped
@@ -204,8 +209,8 @@ def _collect(s, p, middle):
     for i in range(3):
         force = 0.0
         for j in range(3):
-            f = 0.5 * (step.acc[j] + s.acc_last[j]) - s.acc_bias[j]
-            force += middle[i, j] * f
+            f = 0.5 * (step.force[j] + s.force_last[j]) - s.acc_bias[j]
+            force += middle[i, j] * (f * dt + step.missed_force[j])
             block.rotation[i, j] += middle[i, j] * dt
             if (s.clipped >> j) & 1:
                 part = 0.5 if ((step.begun | step.back) >> j) & 1 else 1.0
@@ -215,8 +220,8 @@ def _collect(s, p, middle):
                     middle[i, j] * 0.5 * (s.gyr_last[c] + step.gyr[c]) * dt)
         change = 0.0
         if p.use_acc:
-            block.force[i] += force * dt
-            change = (force - (s.gravity if i == 2 else 0.0)) * dt
+            block.force[i] += force
+            change = force - (s.gravity * dt if i == 2 else 0.0)
         s.position[i] += (s.velocity[i] + 0.5 * change) * dt
         s.velocity[i] += change
     block.time += dt
@@ -420,7 +425,7 @@ def _write(s, p, row, taped):
     cov_world[2, 2] += s.heading_var
     if not taped:    # else the smoother does it, after its correction
         raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)
-    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag)
+    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)
     row.reliability = step.reliability
     row.mag_count = step.mag_count
     if not s.heading_known:

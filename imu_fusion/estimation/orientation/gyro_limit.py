@@ -11,6 +11,7 @@ from imu_fusion.sensors.saturation import (
     start_flat_tops,
 )
 
+_ALIKE = 0.05        # of a limit: what calibrations let those of the axes of one sensor differ by
 _FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
 
 
@@ -44,8 +45,7 @@ def _find_all(found, par, gyr):
 
 
 def ranges_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:
-    """Limits (3,) rad/s as :func:`limits_of` finds them, infinite where no axis has one; an axis
-    that was at its limit too seldom to show it has the range of the others."""
+    """Limits (3,) rad/s as :func:`limits_of` finds them, infinite where no axis has one."""
     limits = limits_of(gyr, par)["limit"][0]
     return np.minimum(limits, limits[np.isfinite(limits)].max(initial=0.0) or np.inf)
 
@@ -54,8 +54,17 @@ def limits_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:
     """What rates (n, 3) rad/s show of the gyroscope's limits, (1,) FLAT_TOPS: its ``limit`` is
     given, found or infinite.
 
+    An axis that reaches the limit of the others and does not pass it has that one, too: behind a
+    calibration that mixes axes its tops are not flat, and it may have been there too seldom.
+
     par: parameters of kernel_parameters.
     """
     found = np.zeros(1, FLAT_TOPS)
     _find_all(found, par, np.ascontiguousarray(gyr))
+    limit, largest = found["limit"][0], found["largest"][0]
+    known = np.isfinite(limit)
+    if known.any() and np.isnan(par["sensor"]["gyro_range"]).any():
+        shared = limit[known].max()
+        alike = ~known & (np.abs(largest / shared - 1.0) < _ALIKE)
+        limit[alike], found["tolerance"][0, alike] = shared, _ALIKE
     return found

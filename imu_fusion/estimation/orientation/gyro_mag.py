@@ -345,7 +345,7 @@ def _write(s, p, row, eq, phi):
                              + p.sensor.acc_bias_sd ** 2)
         row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
-    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag)
+    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)
     row.reliability = step.reliability
     row.mag_count = step.mag_count
     if not s.heading_known:

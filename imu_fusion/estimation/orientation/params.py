@@ -11,9 +11,9 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.parameters.record import record
 from imu_fusion.sensors.params import sensor
 
-# Before there is a sample: one recording in twenty is near iron; what is stated of the gyroscope is
+# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope is
 # given up where the samples are a thousand times likelier without it.
-_LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.05), math.log(0.001)
+_LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.1), math.log(0.001)
 # Rotation from ENU to the world frame that is published, xyzw.
 _WORLD_FRAMES = {
     "enu": (0.0, 0.0, 0.0, 1.0),

@@ -22,9 +22,9 @@ def is_still(s, p):
     limit2 = 0.0
     for i in range(3):
         rest.mean_rate[i] += part * (step.gyr[i] - rest.mean_rate[i])
-        rest.mean_force[i] += part * (step.acc[i] - rest.mean_force[i])
+        rest.mean_force[i] += part * (step.force[i] - rest.mean_force[i])
         rate2 += (step.gyr[i] - rest.mean_rate[i]) ** 2
-        force2 += (step.acc[i] - rest.mean_force[i]) ** 2
+        force2 += (step.force[i] - rest.mean_force[i]) ** 2
         mean2 += (rest.mean_rate[i] - s.gyro_bias[i]) ** 2
         limit2 += s.cov[es.GYRO_BIAS + i, es.GYRO_BIAS + i] + _REST_TURN ** 2
     if (rate2 > p.fusion.rest_rate ** 2 or force2 > p.rest_force ** 2

@@ -38,7 +38,7 @@ FLAG_GAP = 16           # samples are missing before this one
 FLAG_ALIGNING = 32      # inside the interval from which the initial orientation was found
 FLAG_NO_HEADING = 64    # no magnetometer sample has fixed the heading yet
 FLAG_MAG_SATURATED = 128  # a magnetometer sample was refused: an axis is at its limit
-FLAG_HELD = 2048          # a rate that nothing before resembles: the one before stands in for it
+FLAG_HELD = 2048          # a rate or force like nothing before: the one before stands in for it
 # Beside FLAG_SATURATED, one bit for each axis at its limit, x first: 256, 512, 1024.
 SATURATED_AXES_SHIFT = 8
 
@@ -59,25 +59,30 @@ def raise_to_limits(rate, clipped, limits):
 
 
 @njit
-def write_cov_attitude(row, p, cov_world, r):
+def write_cov_attitude(row, p, cov_world, r, dt):
     """Covariance of the attitude's error, imu axes, from that in world axes (3, 3).
 
     It gets what no filter on these sensors can see: their axes in the case, and a delay of
-    the rates, by which a turn of ``row.gyr`` is late. r (3, 3): from imu to world axes.
+    the rates, by which a turn of ``row.gyr`` is late. Whether a rate is that at its stamp or the
+    mean of the step before or after, nobody knows either: half a step, evenly distributed.
+    r (3, 3): from imu to world axes. dt: s, the step before the row.
     """
     rate, cov = row.gyr, row.cov_attitude
+    delay2 = p.gyro_delay_sd ** 2
+    if delay2 > 0.0:
+        delay2 += min(dt, p.gap.max) ** 2 / 12.0
     for j in range(3):
         a = cov_world[0, 0] * r[0, j] + cov_world[0, 1] * r[1, j] + cov_world[0, 2] * r[2, j]
         b = cov_world[1, 0] * r[0, j] + cov_world[1, 1] * r[1, j] + cov_world[1, 2] * r[2, j]
         c = cov_world[2, 0] * r[0, j] + cov_world[2, 1] * r[1, j] + cov_world[2, 2] * r[2, j]
-        late = p.gyro_delay_sd ** 2 * rate[j]
+        late = delay2 * rate[j]
         for i in range(3):
             cov[i, j] = r[0, i] * a + r[1, i] * b + r[2, i] * c + rate[i] * late
         cov[j, j] += p.sensor.axes_sd ** 2
 
 
 @njit
-def write_attitude(row, p, quat, cov_world, mag):
+def write_attitude(row, p, quat, cov_world, mag, dt):
     """Attitude and field of a row whose ``gyr`` is written.
 
     Args:
@@ -85,9 +90,10 @@ def write_attitude(row, p, quat, cov_world, mag):
             the present rate, and in the published world axes.
         cov_world: (3, 3) of the attitude's error in world axes.
         mag: (3,) tesla, imu axes, nan if none.
+        dt: s, the step before the row.
     """
     frame = p.frame_from_enu
     ahead = quat_multiply(quat, quat_exp(row.gyr, p.gyro_delay))
     row.quat_world_imu[:] = quat_normalize(quat_multiply(frame, ahead))
-    write_cov_attitude(row, p, cov_world, quat_to_matrix(ahead))
+    write_cov_attitude(row, p, cov_world, quat_to_matrix(ahead), dt)
     row.mag_world[:] = quat_rotate(frame, quat_rotate(quat, mag))

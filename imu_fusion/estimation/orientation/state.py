@@ -29,13 +29,13 @@ MAG_QUEUE = np.dtype([
 ], align=True)
 """Magnetometer samples that wait for the Imu to pass them (mag_queue)."""
 
-GYRO_SPIKE = np.dtype([
+SPIKE = np.dtype([
     ("usual_change", "f8"),              # from sample to sample
-    ("is_held", "?"),                    # a rate waits for the next to resemble it
-    ("rate", "f8", 3),                   # that rate
+    ("is_held", "?"),                    # a value waits for the next to resemble it
+    ("value", "f8", 3),                  # that value
     ("step", "f8"),                      # s, that it ended
 ], align=True)
-"""Single wild rates (gyro_spike)."""
+"""Single wild values of a sensor (spike)."""
 
 REST = np.dtype([
     ("mean_rate", "f8", 3),              # low-passed, raw
@@ -71,9 +71,11 @@ MAG_SUM = np.dtype([
 
 STEP = np.dtype([
     ("dt", "f8"),                        # s since the sample before
-    ("gyr", "f8", 3),                    # raw
+    ("gyr", "f8", 3),                    # raw; a held rate's stand-in
     ("acc", "f8", 3),                    # raw
+    ("force", "f8", 3),                  # the same; a held force's stand-in
     ("missed", "f8", 3),                 # rad, rotation to make up for after a held rate
+    ("missed_force", "f8", 3),           # m/s, likewise
     ("clipped", "i8"),                   # bits of the gyroscope axes at their limit, x first
     ("begun", "i8"),                     # of those that have just reached it
     ("back", "i8"),                      # of those that have just come back
@@ -86,10 +88,11 @@ STEP = np.dtype([
 """What the newest Imu sample brought: between the parts of one step of the fusion filter."""
 
 COUNT_NAMES = ("imu_used", "imu_rejected", "mag_used", "mag_rejected", "mag_late", "mag_disturbed",
-               "mag_saturated", "gaps", "saturated", "rates_held")
+               "mag_saturated", "gaps", "saturated", "rates_held", "forces_held")
 COUNTS = np.dtype([(name, "i8") for name in COUNT_NAMES], align=True)
 """What became of the samples: used; refused as impossible, out of order or too many; too late;
-disturbed; with an axis at its limit; steps with a gap; Imu samples at a limit; rates held."""
+disturbed; with an axis at its limit; steps with a gap; Imu samples at a limit; rates and forces
+held."""
 
 EQUATION = np.dtype([
     ("rate", "f8", 3), ("rate_next", "f8", 3),   # rad/s at both ends, each in its own imu axes
@@ -122,12 +125,13 @@ STATE = np.dtype([
     ("started", "?"),                    # whether there was one
     ("align_until", "i8"),               # stamp of the end of the first interval
     ("gyr_last", "f8", 3),               # raw, of the newest sample; a held rate's stand-in
-    ("acc_last", "f8", 3),               # raw
+    ("force_last", "f8", 3),             # raw, likewise
     ("history", ROTATION_HISTORY),
     ("queue", MAG_QUEUE),
     ("mag_limit", FLAT_TOPS),            # the search for the magnetometer's range (mag_rejection)
     ("gyro_limit", FLAT_TOPS),           # and the gyroscope's (gyro_limit)
-    ("spike", GYRO_SPIKE),
+    ("gyro_spike", SPIKE),
+    ("acc_spike", SPIKE),
     ("rest", REST),
     ("motion", MOTION),
     ("wander", WANDER),

@@ -6,7 +6,7 @@ the receiver tells them are compared with those that the Imu felt at shifted tim
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.samples.logs import VelocityLog
 
@@ -33,7 +33,7 @@ def find_lag(samples: np.ndarray, velocity: VelocityLog | None) -> float:
         return 0.0
     t = (samples["stamp"] - samples["stamp"][0]) * 1e-9
     at = (velocity.stamp - samples["stamp"][0]) * 1e-9
-    turn = Rotation.from_quat(samples["quat_world_imu"])
+    turn = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"])
     vel = velocity.vel_world
     course = np.unwrap(np.arctan2(vel[:, 1], vel[:, 0]))
     grid = np.arange(min(t[0], at[0]), max(t[-1], at[-1]) + _GRID, _GRID)

@@ -51,6 +51,7 @@ class Sensor(Parameters):
         "mag_matrix", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
     mag_bias_sd: float = sensor("mag_bias_sd", 5e-6)
     mag_scale_sd: float = sensor("mag_scale_sd", 0.1)
+    mag_axes_sd: float = sensor("mag_axes_sd", 0.0)
 
 
 @dataclass(frozen=True)
@@ -203,8 +204,9 @@ _NOT_IN_THE_PAPER = (
     "sensor.gyro_bias_sd", "sensor.gyro_bias_walk", "sensor.gyro_scale_sd", "sensor.acc_bias_sd",
     "sensor.acc_bias_walk", "sensor.acc_matrix_sd", "sensor.mag_noise_sd", "sensor.mag_offset",
     "sensor.mag_matrix", "sensor.mag_bias_sd",
-    "sensor.mag_scale_sd", "gnss.fix_sd", "gnss.velocity_sd", "gnss.covariances", "gnss.loss",
-    "gnss.loss_scale", "gnss.position_error_sd", "gnss.position_error_tau",
+    "sensor.mag_scale_sd", "sensor.mag_axes_sd", "gnss.fix_sd", "gnss.velocity_sd",
+    "gnss.covariances", "gnss.loss", "gnss.loss_scale", "gnss.position_error_sd",
+    "gnss.position_error_tau",
     "gnss.velocity_error_sd", "gnss.velocity_error_tau", "gnss.time_offset_sd",
     "gnss.velocity_time_offset_sd", "gnss.lever_arm", "gnss.lever_arm_sd", "mag.",
     "surface.body_height", "surface.body_height_sd", "surface.lever_arm", "surface.lever_arm_sd",

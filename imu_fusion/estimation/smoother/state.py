@@ -8,6 +8,7 @@ those of the error state; :func:`attitude` and :func:`slow` find the entries of 
 A further state is one line of BLOCKS and one of :class:`StateBlocks`, at their ends.
 """
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -48,6 +49,7 @@ class StateBlocks(NamedTuple):
     surface_lever_arm: int = -1
     gnss_velocity_error: int = -1
     gnss_step: int = -1
+    mag_axes: int = -1
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,8 @@ BLOCKS = (
           lambda p: p.gnss.velocity_error_sd, tau=lambda p: p.gnss.velocity_error_tau),
     Block("gnss_step", "step of the fixes", "m", 1.0, _ENU, lambda p: p.initial.position_sd,
           needs="moved_fix"),
+    Block("mag_axes", "axes of the magnetometer in the imu frame", "°", 180.0 / math.pi, _XYZ,
+          lambda p: p.sensor.mag_axes_sd, needs="mag"),
 )
 
 # Least standard deviation of a Gauss-Markov component, in m or m/s: one that is given as zero

@@ -6,8 +6,7 @@ that rests on averaging is less certain by as much.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+import scipy  # its parts are loaded where they are first used
 
 _BLOCK = 5_000_000_000   # ns, over which innovations are averaged
 _FEWEST = 3              # innovations in a block, and blocks
@@ -34,7 +33,7 @@ def wandering(stamp: np.ndarray, innovations: np.ndarray) -> float:
     if n < _FEWEST:
         return 1.0
     excess = float(np.sqrt(np.mean(means ** 2, axis=0).max()))
-    by_chance = np.sqrt(chi2.isf(_CHANCE, n) / n)
+    by_chance = np.sqrt(scipy.stats.chi2.isf(_CHANCE, n) / n)
     return excess if excess > max(_EXCESS, by_chance) else 1.0
 
 
@@ -53,7 +52,7 @@ def widen(samples: np.ndarray, wander: dict[str, float]) -> None:
         samples[name] *= receiver
     field = wander.get("mag", 1.0)
     if field > receiver:
-        up = Rotation.from_quat(samples["quat_world_imu"]).as_matrix()[:, 2]
+        up = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"]).as_matrix()[:, 2]
         heading = np.einsum("ni,nij,nj->n", up, samples["cov_attitude"], up)
         more = ((field / receiver) ** 2 - 1.0) * heading
         samples["cov_attitude"] += more[:, None, None] * up[:, :, None] * up[:, None]

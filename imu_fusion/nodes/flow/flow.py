@@ -98,6 +98,8 @@ class Flow:
             self.sink.gate.aside = True
             executor.spin_once(timeout_sec=0.0)
             self.sink.gate.aside = False
+        if seconds == 0.0:
+            return
         if self.source.is_shut():
             time.sleep(min(seconds, _POLL))
         elif not self.sink.wait(min(seconds, _SERVE_EVERY)):

@@ -9,11 +9,13 @@ from imu_fusion.errors import SampleError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.impact_metrics import (
     STANDARD_GRAVITY,
+    UNITS,
     ImpactParams,
     bric,
     channel_filter,
     damage,
     find_events,
+    find_peaks,
     gambit,
     hic,
     measure_impacts,
@@ -165,6 +167,19 @@ def test_metrics_of_the_simulated_impact(impact):
     assert first["clip_3ms"] < first["peak_linear_acceleration"]
     assert first["saturated_samples"] == 0 and first["complete"]
     json.dumps(found)
+
+
+def test_peaks_need_no_impact_and_all_numbers_have_units(impact):
+    motion, rows = impact
+    center = (0.0, 0.0, 0.75)
+    peaks = find_peaks(rows, [center], 9.8)
+    assert peaks["peak_linear_acceleration"][0] == pytest.approx(
+        np.linalg.norm(motion.acceleration_world(center), axis=1).max(), rel=1e-3)
+    assert peaks["peak_angular_velocity"] == pytest.approx(
+        np.linalg.norm(motion.omega, axis=1).max(), rel=1e-3)
+    (event, *_) = measure_impacts(rows, [center], 9.8, ImpactParams(trigger=20.0))
+    numbers = {k for k, v in {**event, **peaks}.items() if isinstance(v, (float, list))}
+    assert numbers <= set(UNITS)
 
 
 def test_axes_matter_for_damage_only(impact):

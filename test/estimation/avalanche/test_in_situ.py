@@ -123,3 +123,17 @@ def test_too_little_is_refused():
         calibrate_in_situ(samples, Constraint(NORMAL, G))
     with pytest.raises(CalibrationError, match="force at rest"):
         calibrate_in_situ(tumbling_on_the_slope()[0], Constraint(NORMAL, G), realign=NORMAL)
+
+
+@pytest.mark.parametrize("seed", [10, 13])
+def test_realignment_does_not_run_away_from_wrong_attitudes(seed):
+    """Attitudes that wander by tens of degrees: full steps leave 18 and 30 m."""
+    samples, _ = tumbling_on_the_slope(seed=seed)
+    wander = .2 * np.cumsum(np.random.default_rng(seed).standard_normal((len(samples.time), 3)),
+                            axis=0)
+    samples = replace(samples, quat=(Rotation.from_rotvec(wander)
+                                     * Rotation.from_quat(samples.quat)).as_quat())
+    rest = samples.force[0] * G / np.linalg.norm(samples.force[0])
+    field = Rotation.from_quat(samples.quat[0]).inv().apply([1.0, 21.0, -43.0])
+    found = calibrate_in_situ(samples, Constraint(NORMAL, G, rest_force=rest), field)
+    assert found.violation < 3.0

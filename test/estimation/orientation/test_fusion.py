@@ -305,6 +305,33 @@ def test_single_wild_rates_do_not_turn_the_attitude(ordinary):
     assert rmse_deg(rows, truth) < 1.1 * rmse_deg(OrientationEstimator().run(imu, mag), truth)
 
 
+def test_single_wild_forces_do_not_tilt_the_attitude_and_are_published(ordinary):
+    imu, mag, truth, _ = ordinary
+    wild = np.arange(400, len(imu.stamp), 301)
+    acc = imu.acc.copy()
+    acc[wild] += np.random.default_rng(1).choice([-1.0, 1.0], (len(wild), 3)) * 1000.0
+    estimator = OrientationEstimator()
+    rows = estimator.run(ImuLog(imu.stamp, imu.gyr, acc), mag)
+    assert list(np.flatnonzero(rows["flags"] & FLAG_HELD)) == list(wild)
+    assert estimator.summary()["forces_held"] == len(wild)
+    # Each would push it by 1000 m/s^2 times 5 ms in each axis, 9 m/s.
+    assert rmse_deg(rows, truth) < 1.1 * rmse_deg(OrientationEstimator().run(imu, mag), truth)
+    assert np.abs(rows["acc"] - acc).max() < 1.0
+
+
+def test_a_sudden_push_is_motion_and_none_of_it_is_lost():
+    """At rest, then at once 400 m/s^2 for 20 ms and back: held for one sample, then made up for."""
+    n = 800
+    stamp = np.arange(n, dtype=np.int64) * 5_000_000
+    force = np.tile([0.0, 0.0, 9.81], (n, 1))
+    force[600:604, 0] = 400.0
+    estimator = make({"fusion.gyro_factor": 1.0, "fusion.velocity_sd": 100.0})
+    rows = estimator.run(ImuLog(stamp, np.zeros((n, 3)), force)[:606])
+    assert 600 in np.flatnonzero(rows["flags"] & FLAG_HELD)
+    # Trapezoids over 4 samples between two that are still: 4 steps of 2 m/s.
+    assert estimator.get_state()["state"][0]["velocity"][0] == pytest.approx(8.0, rel=0.02)
+
+
 def test_a_sudden_turn_is_motion_and_none_of_it_is_lost():
     """At rest, then at once 20 rad/s for 0.1 s: held for one sample, then made up for."""
     n = 1000

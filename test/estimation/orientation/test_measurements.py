@@ -57,10 +57,10 @@ def some_state(rng):
     s["mag_lag"] = 0.0
     field = rng.normal(size=3)
     s["field"] = field / np.linalg.norm(field)
-    s["field_norm"], s["heading_known"] = 48e-6, True
+    s["field_norm"], s["field_scatter"], s["heading_known"] = 48e-6, 1e-3, True
     s["cov"] = 1e-4 * np.eye(es.N)
     s["block"]["time"] = 0.02
-    for name in ("gyr_last", "acc_last"):
+    for name in ("gyr_last", "force_last"):
         s[name] = rng.normal(size=3)
     s["step"]["gyr"], s["rest"]["mean_rate"] = rng.normal(size=(2, 3))
     return state

@@ -72,13 +72,16 @@ def test_heading_sd_is_the_anchored_headings(resting):
 
 
 def test_gyro_delay_sd_is_part_of_the_covariance_while_turning(moving):
+    """With half a step, evenly distributed, between rates at their stamps and means of a step."""
     # Of one hypothesis: a mixture's is added in the axes of each.
     rows = [run(moving, {"sensor.gyro_delay_sd": sd, "fusion.local_field_sd": 0.01,
                          "fusion.gyro_factor": 1.0})
             for sd in (0.0, 0.01)]
     added = rows[1]["cov_attitude"] - rows[0]["cov_attitude"]
     rate = rows[0]["gyr"]
-    assert added == pytest.approx(0.01 ** 2 * rate[:, :, None] * rate[:, None, :], abs=1e-12)
+    step = np.diff(rows[0]["stamp"], prepend=rows[0]["stamp"][0]) * 1e-9
+    late = 0.01 ** 2 + step[:, None, None] ** 2 / 12.0
+    assert added == pytest.approx(late * rate[:, :, None] * rate[:, None, :], abs=1e-12)
 
 
 @pytest.mark.parametrize("method", [{}, PRINTED], ids=["fusion", "as printed"])

@@ -43,7 +43,8 @@ def left_out_of_fix(h, tau, step, interval, x):
 def left_out_of_mag(h, tau, step, interval, x):
     """What the errors of the gyroscope turn the field by within tau."""
     gain = 1.0 + slow_states(x, BLOCKS.mag_scale, 3)
-    turn = -tau * gain[:, None] * skew(step["rotation"].T @ FIELD)
+    axes = np.eye(3) + skew(slow_states(x, BLOCKS.mag_axes, 3))
+    turn = -tau * gain[:, None] * (axes @ skew(step["rotation"].T @ FIELD))
     h[:, GYR_BIAS:GYR_BIAS + 3] += turn
     h[:, BLOCKS.gyr_scale:BLOCKS.gyr_scale + 3] -= turn * interval["gyr"]
     assert np.abs(turn).max() < 0.5  # uT per rad/s, as the docstring says
@@ -87,7 +88,7 @@ def test_rows_of_a_measurement_are_its_derivatives(kind, tau):
 
 def test_transition_is_the_derivative_of_the_motion():
     rng = np.random.default_rng(0)
-    x, interval, model = random_state(rng), interval_of(rng, 0.02), model_of_all(FIELD)
+    interval, x, model = interval_of(rng, 0.02), random_state(rng), model_of_all(FIELD)
     decay = np.ones(SIZE)
     decay[BLOCKS.gnss_position_error:BLOCKS.gnss_position_error + 3] = 0.9
     f = transition_matrix(x, interval, model, decay)

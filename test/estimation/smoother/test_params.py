@@ -28,6 +28,7 @@ CHANGED = {
     "sensor.mag_noise_sd": (1e-5, {}),
     "sensor.mag_bias_sd": (1e-6, {}),
     "sensor.mag_scale_sd": (0.01, {}),
+    "sensor.mag_axes_sd": (0.02, {}),
     "gap.max": (0.03, {}),
     "gap.gyro_noise_density": (0.3, {"sensor.gyro_range": (2.0,)}),
     "gap.acc_noise_density": (0.5, {"sensor.acc_range": (30.0,)}),

@@ -28,6 +28,8 @@ _WHITE_TIME = 0.02         # s: faster sampling of the same disturbance is no ne
 _TAIL_DOF = 5.0
 # Columns: attitude (2), field, local field, lag, offset (3), matrix (9).
 _LAG, _OFFSET, _MATRIX, _COLUMNS = 4, 5, 8, 17
+_EXPECTED_BLOCKS = 500     # in motion, some 10 s: as much as they tell of places, a hypothesis does
+_FIRST_BLOCKS = 50         # in motion: three places, whose mean begins the scatter
 _IRON = 12                 # states of hard and soft iron
 
 
@@ -41,6 +43,7 @@ def start_field(s, p, z, has_heading, follow):
     """
     cov = s.cov
     s.field_norm = math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2)
+    s.field_scatter, s.scattered = _usual_scatter(p), 0
     b = (z[0] / s.field_norm, z[1] / s.field_norm, z[2] / s.field_norm)
     for i in range(3):
         s.field[i] = b[i]
@@ -93,11 +96,11 @@ def _share_errors(s, p, b, has_heading, follow):
 def judge_anchor(s, p):
     """Variance of an anchored heading, which no later sample changes.
 
-    Beside its own it has what the local field and hard and soft iron turned the first needle by,
-    iron so far as it is known by now: what it is found to be, and what that leaves open. The
-    filter takes the first needle for true, hence iron for zero in that one pose, and of each state
-    keeps only what that leaves open. That much of its variance is no knowledge: it counts as the
-    prior until turning has made it smaller.
+    Beside its own it has what the place and hard and soft iron turned the first needle by, iron so
+    far as it is known by now: what it is found to be, and what that leaves open. The filter takes
+    the first needle for true, hence iron for zero in that one pose, and of each state keeps only
+    what that leaves open. That much of its variance is no knowledge: it counts as the prior until
+    turning has made it smaller.
     """
     if not s.is_anchored:
         return
@@ -111,14 +114,24 @@ def judge_anchor(s, p):
                                  s.mag_matrix[(a - 3) // 3, (a - 3) % 3])
         open_part = min(s.cov[i, i] / one_pose, 1.0) if one_pose > 0.0 else 1.0
         variance += s.anchor[a] ** 2 * open_part * (hard if a < 3 else soft)
-    # The place turned the needle, too: by more than heading_sd allows where it is near iron.
-    # What places do on average is measured, whatever was expected of them.
-    usual = p.fusion.local_field_sd[0]
-    expected = (p.local_field_sd ** 2 + p.fusion.mag_disturbance_sd ** 2 + hard + soft)
-    excess = max(s.field_scatter - expected, 0.0)
-    place = max(p.local_field_sd ** 2 - usual ** 2 + excess, 0.0) * (
-        s.anchor[0] ** 2 + s.anchor[1] ** 2 + s.anchor[2] ** 2)
+    place = _place_variance(s, p) * (s.anchor[0] ** 2 + s.anchor[1] ** 2 + s.anchor[2] ** 2)
     s.heading_var = min(p.heading_sd ** 2 + place + turned ** 2 + variance, es.UNIFORM_VARIANCE)
+
+
+@njit
+def _place_variance(s, p):
+    """Variance of what the place of the first needle added to it, beyond what is usual: what places
+    are found to do, and at first what the hypothesis expects of them."""
+    expected = p.local_field_sd ** 2 - p.fusion.local_field_sd[0] ** 2
+    return max(s.field_scatter - _usual_scatter(p),
+               expected * _EXPECTED_BLOCKS / (_EXPECTED_BLOCKS + s.scattered), 0.0)
+
+
+@njit
+def _usual_scatter(p):
+    """Mean square per axis of a sample about the field where nothing is near."""
+    return (p.fusion.local_field_sd[0] ** 2 + p.fusion.mag_disturbance_sd ** 2
+            + p.fusion.mag_offset_sd ** 2 + p.fusion.mag_matrix_sd ** 2)
 
 
 @njit
@@ -227,9 +240,7 @@ def field(s, p, error, rows):
     expected = (s.field[0] + s.local_field[0], s.field[1] + s.local_field[1],
                 s.field[2] + s.local_field[2])
     if not s.step.still:    # at rest a place repeats itself
-        s.scattered += 1
-        off = ((z[0] - s.field[0]) ** 2 + (z[1] - s.field[1]) ** 2 + (z[2] - s.field[2]) ** 2) / 3.0
-        s.field_scatter += (off - s.field_scatter) / s.scattered
+        _judge_scatter(s, z)
     deviation = abs(math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2) - 1.0)
     sd = p.fusion.mag_disturbance_sd + p.fusion.norm_deviation_factor * deviation
     variance = (sd * sd * max(_WHITE_TIME / s.block.time, 1.0 / count)
@@ -249,6 +260,19 @@ def field(s, p, error, rows):
     variance *= (_TAIL_DOF + distance) / (_TAIL_DOF + 3.0)
     for i in range(3):
         rows[i].variance = variance
+
+
+@njit
+def _judge_scatter(s, z):
+    """Take the field z (3,) of one block into its mean square about that of the surroundings: as
+    the scale of a t distribution, in which a magnet that is passed counts little."""
+    s.scattered += 1
+    off = ((z[0] - s.field[0]) ** 2 + (z[1] - s.field[1]) ** 2 + (z[2] - s.field[2]) ** 2) / 3.0
+    weight = 1.0
+    if s.scattered > _FIRST_BLOCKS:
+        scale = max(s.field_scatter, _FIRST_FIELD_SD ** 2)
+        weight = (_TAIL_DOF + 3.0) / (_TAIL_DOF + 3.0 * off / scale)
+    s.field_scatter += (weight * off - s.field_scatter) / s.scattered
 
 
 @njit

@@ -1,18 +1,16 @@
-"""Calibrations from recordings, as parameter files that nodes and ``process`` read."""
+"""A magnetometer calibrated in situ, from a recording in which it turned."""
 
 import math
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from imu_fusion.errors import ImuFusionError, TopicError
+from imu_fusion.calibrate.files import parameter_text, read_topic
+from imu_fusion.errors import ImuFusionError
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
-from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.logs import read_log
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, calibrate_magnetometer
 
-_MAG, _FIX = "imu/mag", "fix"
+_MAG = "imu/mag"
 _SCATTER = 0.05      # of the field, beyond which one ellipsoid does not describe the samples
 _COVERAGE = 0.3      # of the directions, below which the fit is one of a ring
 
@@ -34,14 +32,8 @@ def calibrate_recorded_magnetometer(bag: str | Path, topic: str = _MAG
         TopicError: no such topic. CalibrationError: directions that do not determine it.
     """
     norm, remarks = None, []
-    with open_bag(bag) as reader:
-        names = {name.lstrip("/") for name in reader.topics}
-        if topic.lstrip("/") not in names:
-            raise TopicError(f"{bag}: no topic {topic}; there are: {', '.join(sorted(names))}")
-        mag = read_log(reader, topic)
-        fix = read_log(reader, _FIX) if _FIX in names else None
-    if fix is not None and fix.usable.any():
-        first = fix[fix.usable][0]
+    mag, first = read_topic(bag, topic)
+    if first is not None:
         try:
             norm = float(np.linalg.norm(magnetic_field_world(
                 float(first.latitude_deg[0]), float(first.longitude_deg[0]),
@@ -76,7 +68,10 @@ def magnetometer_parameters(found: MagCalibration, bag: str | Path) -> str:
     values = {name: value for name, value in found.to_parameters().items()
               if name.startswith("sensor.")}
     worst = 1e6 * math.sqrt(found.cov.diagonal()[:3].max())
-    return (f"# Magnetometer, calibrated in situ from {Path(bag).name}: {found.samples} samples, "
-            f"{100 * found.coverage:.0f} % of\n# the directions, offset good to {worst:.2f} uT, "
-            f"norm scatters by {1e6 * found.residual_sd:.2f} uT.\n"
-            + yaml.safe_dump({"/**": {"ros__parameters": values}}, default_flow_style=None))
+    return parameter_text(
+        "magnetometer", values, bag,
+        [f"{found.samples} samples, {100 * found.coverage:.0f} % of the directions, offset good to "
+         f"{worst:.2f} uT,", f"norm scatters by {1e6 * found.residual_sd:.2f} uT"],
+        {"method": "ellipsoid", "residual_sd": float(found.residual_sd),
+         "condition": float(found.condition), "coverage": float(found.coverage),
+         "samples": found.samples, "covariance": [float(v) for v in found.cov.ravel()]})

@@ -1,0 +1,1 @@
+"""Calibrations from recordings, as parameter files that nodes and ``process`` read."""

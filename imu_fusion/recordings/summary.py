@@ -1,0 +1,68 @@
+"""Several recordings beside each other: their results.json as the rows of one table."""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from imu_fusion.errors import BagError
+from imu_fusion.recordings.results import read_results
+
+SUMMARY_FILE = "summary.csv"
+
+
+def names_of(bags: Iterable[str | Path]) -> dict[str, str | Path]:
+    """Names of recordings, without the endings of files, to their paths.
+
+    Raises:
+        BagError: two have the same name.
+    """
+    names: dict[str, str | Path] = {}
+    for bag in bags:
+        name = Path(bag).resolve().stem
+        if name in names:
+            raise BagError(f"{bag}: called {name}, as {names[name]} is; their estimates would go "
+                           "to one place. Rename one, or process them one by one")
+        names[name] = bag
+    return names
+
+
+def write_summary(folder: Path, names: Iterable[str]) -> Path:
+    """Write summary.csv: a row for each recording, a column for each number that was found.
+
+    Args:
+        folder: where the recordings with the estimates are. names: theirs; one that is not there
+            has an empty row.
+
+    Returns:
+        the file.
+
+    Raises:
+        BagError: it cannot be written.
+    """
+    rows = [{"recording": name} | dict(_numbers(read_results(folder / name) or {}))
+            for name in names]
+    file = folder / SUMMARY_FILE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(file, "w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(dict.fromkeys(key for row in rows for key in row)))
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise BagError(f"{file}: cannot be written ({error.strerror})") from None
+    return file
+
+
+def _numbers(found: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers in nested results, with their names joined by dots; of texts, how many there are."""
+    for key, value in found.items():
+        name = f"{above}{key}"
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{name}.")
+        elif isinstance(value, list) and value and isinstance(value[0], str):
+            yield name, len(value)
+        elif isinstance(value, list):
+            yield from _numbers({str(i): v for i, v in enumerate(value)}, f"{name}.")
+        elif value is not None:
+            yield name, value

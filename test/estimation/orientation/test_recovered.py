@@ -1,0 +1,69 @@
+"""Rates beyond the range, recovered from a recording whose calibration mixes its axes."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imu_fusion.estimation.orientation.gyro_limit import limits_of, ranges_of
+from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
+from imu_fusion.estimation.orientation.recovered import recover
+from imu_fusion.samples.logs import ImuLog, MagLog
+
+RATE, RANGE = 150, 6.0
+FIELD = np.array([1e-6, 21e-6, -43e-6])
+MIXED = np.eye(3) + np.array([[0.0, 0.006, -0.004], [-0.005, 0.0, 0.006], [0.006, 0.005, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def rolling():
+    """Two seconds of rest, then eight of rolling about an axis that all three axes see, clipped
+    before a calibration: log, field, true rates (n, 3)."""
+    rng = np.random.default_rng(8)
+    time = np.arange(10 * RATE) / RATE
+    speed = 14.0 * np.clip(time - 2.0, 0.0, 1.0) * (1.0 + 0.3 * np.sin(2.0 * time))
+    axis = np.column_stack([0.8 + 0.1 * np.sin(time), 0.5 + 0.1 * np.cos(1.3 * time),
+                            0.33 * np.ones_like(time)])
+    true = speed[:, None] * axis
+    steps = Rotation.from_rotvec(true / RATE)
+    attitude, quats = Rotation.from_euler("xyz", [0.3, 0.2, 1.0]), []
+    for step in steps:
+        quats.append(attitude.as_quat())
+        attitude = attitude * step
+    body = Rotation.from_quat(quats).inv()
+    seen = np.clip(true + 0.005 * rng.standard_normal(true.shape), -RANGE, RANGE) @ MIXED.T
+    stamp = 10**18 + np.round(time * 1e9).astype(np.int64)
+    force = body.apply([0.0, 0.0, 9.81]) + 0.05 * rng.standard_normal(true.shape)
+    field = body.apply(FIELD) + 1e-7 * rng.standard_normal(true.shape)
+    return ImuLog(stamp, seen, force), MagLog(stamp, field), true
+
+
+def test_what_is_recovered_and_what_is_measured_beside_it_state_their_errors(rolling):
+    imu, mag, true = rolling
+    found = recover(imu, mag, OrientationParams().replace(**{
+        "fusion.use_acc": False, "sensor.gyro_range": (RANGE,), "sensor.gyro_scale_sd": 0.006}))
+    assert len(found) == len(imu)
+    fast = np.abs(true).max(axis=1) > 1.2 * RANGE
+    beside = fast[:, None] & (np.abs(true) < 0.9 * RANGE)
+    error = np.abs(found.gyr - true)
+    # Five times the noise: the calibration mixes in what the clipped axis lacks.
+    assert np.sqrt(np.mean(error[beside] ** 2)) > 0.02
+    assert np.mean(error[beside] < 3.0 * found.gyr_sd[beside]) > 0.95
+    beyond = np.abs(true) > 1.1 * RANGE
+    assert np.mean(error[beyond] < 3.0 * found.gyr_sd[beyond]) > 0.95
+    # Seconds of rolling are held by the field; their errors taken as one would state far more.
+    assert np.median(found.gyr_sd[beyond]) < 20.0
+
+
+def test_an_axis_that_stops_where_the_others_do_is_clipped_too():
+    """x and y show flat tops; z wobbles below the same level and never passes it."""
+    time = np.arange(3000) / RATE
+    gyr = np.column_stack([np.clip(15.0 * np.sin(3.0 * time + k), -RANGE, RANGE)
+                           for k in range(3)])
+    rng = np.random.default_rng(1)
+    top = np.abs(gyr[:, 2]) >= RANGE
+    gyr[top, 2] *= 1.0 - 0.03 * rng.random(top.sum())
+    parameters = kernel_parameters(OrientationParams())
+    assert ranges_of(gyr, parameters) == pytest.approx([RANGE] * 3, rel=0.01)
+    assert limits_of(gyr, parameters)["limit"][0] == pytest.approx([RANGE] * 3, rel=0.01)
+    slow = gyr * [1.0, 1.0, 0.5]      # one that never came near keeps its own
+    assert np.isinf(limits_of(slow, parameters)["limit"][0, 2])

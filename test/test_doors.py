@@ -1,0 +1,182 @@
+"""The same options at every door, and results that one can take away."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from imu_fusion import batch, cli
+from imu_fusion.messages.layouts import IMU
+from imu_fusion.nodes.pipeline import plan_pipeline
+from imu_fusion.nodes.replayer import ReplayerParams
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.logs import read_log
+from imu_fusion.report.contents import smoothed_of
+from imu_fusion.report.recording import write_recording_report
+from imu_fusion.report.trajectory_data import read_result
+from test.nodes.test_smoother import write as write_drive
+from test.report.test_report import Page
+from test.test_cli import write
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def call(*arguments, code=0):
+    result = CliRunner().invoke(cli.cli, list(map(str, arguments)), catch_exceptions=False)
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.fixture
+def renamed(tmp_path):
+    """A drive as a robot records it: its Imu with somebody's orientation on imu/data, its fixes on
+    gps/fix."""
+    with open_bag(write_drive(tmp_path / "plain", 400)) as reader, \
+            BagWriter(tmp_path / "robot") as writer:
+        for topic, msgtype, log_time, cdr in reader.messages():
+            name = {"/fix": "/gps/fix", "/imu/data_raw": "/imu/data"}.get(topic, topic)
+            writer.write(name, msgtype, cdr, log_time)
+    return tmp_path / "robot"
+
+
+REMAP = {"/imu/data_raw": "/imu/data", "/fix": "/gps/fix"}
+OPTIONS = [word for name, other in REMAP.items() for word in ("--remap", f"{name}:={other}")]
+
+
+def test_a_recording_reads_the_same_under_other_names(renamed, tmp_path):
+    with open_bag(tmp_path / "plain") as plain, open_bag(renamed, remap=REMAP) as reader:
+        assert set(reader.topics) == set(plain.topics) and not reader.warnings
+        assert {name: info.count for name, info in reader.topics.items()} == {
+            name: info.count for name, info in plain.topics.items()}
+        assert [(t, n, bytes(c)) for t, _, n, c in reader.messages()] == [
+            (t, n, bytes(c)) for t, _, n, c in plain.messages()]
+        np.testing.assert_array_equal(read_log(reader, "fix").latitude_deg,
+                                      read_log(plain, "fix").latitude_deg)
+
+
+def test_what_has_the_new_name_already_is_left_out_and_said(tmp_path):
+    bag = tmp_path / "bag"
+    with BagWriter(bag) as writer:
+        for topic, stamp in (("/imu/data_raw", 1), ("/imu/better", 2)):
+            writer.write(topic, IMU.msgtype, IMU.encode(stamp, "i", np.zeros(IMU.size)), stamp)
+    with open_bag(bag, remap={"/imu/data_raw": "/imu/better"}) as reader:
+        assert [stamp for _, _, stamp, _ in reader.messages()] == [2]
+        assert "/imu/data_raw of the recording is left out" in reader.warnings[0]
+
+
+def test_process_report_and_convert_take_one_remap(renamed, tmp_path):
+    plain, other = tmp_path / "of_plain", tmp_path / "of_robot"
+    call("process", tmp_path / "plain", plain)
+    call("process", renamed, other, *OPTIONS, "--report")
+    assert (json.loads((plain / "results.json").read_text())["smoother"]
+            == json.loads((other / "results.json").read_text())["smoother"])
+    headings = [h.split("<")[0] for h in (other / "report.html").read_text().split("<h2>")[1:]]
+    assert "Trajectory" in headings and "GNSS" in headings and "Orientation" in headings
+    call("convert", renamed, tmp_path / "converted", *OPTIONS)
+    with open_bag(tmp_path / "converted") as reader:
+        assert {"/imu/data_raw", "/fix"} <= set(reader.topics)
+    for command in ("process", "report", "convert"):
+        out = ["--out", tmp_path / "x.html"] if command == "report" else [tmp_path / "x"]
+        words = call(command, renamed, *out, "--remap", "fix:=/gps", code=1)
+        assert "no topic '/gps'; it has: " in words and "/gps/fix" in words
+
+
+def test_a_pipeline_plays_what_is_renamed_though_an_estimate_has_its_name(renamed):
+    plan = plan_pipeline(renamed, without=["orientation_estimator"], remap=REMAP)
+    assert plan.outdated == () and plan.renamed == REMAP
+    parameters = ReplayerParams.from_mapping(
+        {k: v for k, v in plan.replay_parameters(renamed).items() if v != ()})
+    assert set(parameters.remap) == {"/imu/data:=/imu/data_raw", "/gps/fix:=/fix"}
+
+
+def test_play_hands_its_remap_to_the_replayer(monkeypatch):
+    given = []
+    monkeypatch.setattr("imu_fusion.nodes.main", lambda words, node: given.extend(words) or 0)
+    call("play", "bag", *OPTIONS)
+    assert "remap:=['/imu/data:=/imu/data_raw', '/gps/fix:=/fix']" in given
+
+
+def test_a_report_shows_the_trajectory_that_it_is_given(tmp_path):
+    """Read back from the messages, it is the one that was smoothed."""
+    bag = write_drive(tmp_path / "bag", 400)
+    (report,) = [r for r in batch.process(bag, tmp_path / "out")[0] if r.node == "smoother"]
+    whole, _ = smoothed_of(report, 0)
+    with open_bag(tmp_path / "out") as reader:
+        found, remarks, why = read_result(reader)
+    assert not why and remarks == report.remarks
+    for name in ("position_world", "vel_world", "quat_world_imu", "gyr", "acc", "acc_sd",
+                 "cov_position", "cov_attitude", "cov_velocity", "gyr_sd"):
+        np.testing.assert_allclose(found.samples[name], whole.result.samples[name], rtol=1e-6,
+                                   atol=1e-9)
+    assert found.frame == whole.result.frame and found.summary() == whole.result.summary()
+    smoothed = write_recording_report(bag, tmp_path / "out", tmp_path / "r.html").smoothed
+    np.testing.assert_array_equal(smoothed.result.samples["position_world"],
+                                  found.samples["position_world"])
+
+
+def test_a_report_without_a_trajectory_says_why(tmp_path):
+    bag = write(tmp_path / "bag")
+    out = tmp_path / "r.html"
+    call("report", bag, "--out", out)
+    assert "There is no smoothed trajectory: no messages on 'fix'" in Page(out.read_text()).text
+    call("report", bag, "--out", out)    # over the last one
+    call("process", bag, tmp_path / "out", "--report")
+    call("report", bag, "--estimates", tmp_path / "out", "--out", tmp_path / "out" / "report.html")
+
+
+def test_what_fails_leaves_nothing_behind(tmp_path):
+    bag = write(tmp_path / "bag")
+    with BagWriter(tmp_path / "nothing") as writer:
+        writer.add_topic("/text", "std_msgs/msg/String")
+    before = sorted(tmp_path.rglob("*"))
+    for arguments in (["process", bag, tmp_path / "a" / "b" / "out", "--without", "smoother",
+                       "--without", "orientation_estimator"],
+                      ["process", tmp_path / "nothing", tmp_path / "a" / "out"],
+                      ["convert", tmp_path / "bag" / "metadata.yaml", tmp_path / "a" / "out"],
+                      ["convert", bag, tmp_path / "a" / "out", "--topic", "/none"],
+                      ["export", tmp_path / "nothing", tmp_path / "a" / "tables"]):
+        call(*arguments, code=1)
+        assert sorted(tmp_path.rglob("*")) == before, arguments
+
+
+def test_several_recordings_in_one_call_and_a_table_of_what_was_found(tmp_path):
+    first, second = (write_drive(tmp_path / name, 300) for name in ("first", "second"))
+    (tmp_path / "broken.mcap").write_bytes(b"nothing")
+    said = call("process", first, tmp_path / "broken.mcap", second, tmp_path / "monday",
+                "--without", "orientation_estimator", code=1)
+    assert "failed: " in said
+    with open(tmp_path / "monday" / "summary.csv") as stream:
+        rows = {row["recording"]: row for row in csv.DictReader(stream)}
+    assert list(rows) == ["first", "broken", "second"] and rows["broken"]["smoother.samples"] == ""
+    found = json.loads((tmp_path / "monday" / "second" / "results.json").read_text())["smoother"]
+    assert float(rows["second"]["smoother.cost"]) == found["cost"]
+    assert float(rows["first"]["smoother.origin.latitude_deg"]) == found["origin"]["latitude_deg"]
+    said = call("process", first, first, tmp_path / "tuesday", code=1)
+    assert "called first, as" in said and not (tmp_path / "tuesday").exists()
+
+
+def test_export_writes_the_forms_that_are_asked_for(tmp_path):
+    bag = write_drive(tmp_path / "bag", 30)
+    call("export", bag, tmp_path / "tracks", "--gpx")
+    assert [f.name for f in (tmp_path / "tracks").iterdir()] == ["fix.gpx"]
+    call("export", bag, tmp_path / "both", "--csv", "--gpx", "--topic", "fix")
+    assert sorted(f.name for f in (tmp_path / "both").iterdir()) == ["fix.csv", "fix.gpx"]
+    assert "of the form tum" in call("export", bag, tmp_path / "none", "--tum", code=1)
+
+
+def test_the_layout_for_foxglove_shows_topics_that_there_are():
+    layout = json.loads((ROOT / "config" / "foxglove.json").read_text())
+    text = json.dumps(layout["configById"])
+    from test.documents import topics
+    shown = {part.strip('"') for part in text.replace(".", '"').split('"')
+             if part.startswith("/")}
+    assert shown and all(name.strip("/") in topics() for name in shown), shown
+
+    def leaves(node):
+        return {node} if isinstance(node, str) else leaves(node["first"]) | leaves(node["second"])
+
+    assert leaves(layout["layout"]) == set(layout["configById"])
