@@ -108,12 +108,8 @@ def _wandering(found, model, name, error):
     readings = found.problem.readings
     root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
     sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
-    tau = model.params.get(f"{error}_tau")
-    for factor in (1.0, 3.0):
-        for time in (tau, tau / 4.0):
-            for other in _where_zero(model, {f"{error}_sd": tuple((factor * sd).tolist())}):
-                yield other.changed({f"{error}_tau": time})._replace(
-                    noise={**model.noise, name: white * model.noise.get(name, 1.0)})
+    for other in _where_zero(model, {f"{error}_sd": tuple(sd.tolist())}):
+        yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
 
 
 def _where_zero(model, changes):

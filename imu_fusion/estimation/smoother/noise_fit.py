@@ -10,6 +10,7 @@ import scipy  # its parts are loaded where they are first used
 from imu_fusion.estimation.smoother.attempt import Model
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.problem import Problem
+from imu_fusion.estimation.smoother.state import BLOCKS
 
 _SENSOR = ("sensor.gyro_noise_density", "sensor.acc_noise_density", "sensor.gyro_bias_walk",
            "sensor.acc_bias_walk")
@@ -28,20 +29,30 @@ def fit_noise(problem: Problem, model: Model) -> Model:
     """
     present = np.unique(problem.readings["kind"])
     names = [MEASUREMENTS[kind].name for kind in present if MEASUREMENTS[kind].name != "mag"]
+    wandering = [b.name for b in BLOCKS if b.tau is not None and getattr(problem.blocks, b.name) >= 0]
+    size = len(_SENSOR) + len(names)
+
+    def receiver(factors: np.ndarray) -> tuple[dict, dict]:
+        return (dict(zip(names, factors[len(_SENSOR):size])),
+                dict(zip(wandering, factors[size:].reshape(-1, 2))))
 
     def cost(logs: np.ndarray) -> float:
         factors = np.exp(logs)
         return (0.5 * float(np.sum(np.square(logs / _SPREAD)))
-                - problem.log_likelihood(factors[:2], factors[2:4], dict(zip(names, factors[4:])),
-                                         _SAMPLES))
+                - problem.log_likelihood(factors[:2], factors[2:4], *receiver(factors), _SAMPLES))
 
-    start = np.zeros(len(_SENSOR) + len(names))
+    start = np.zeros(size + 2 * len(wandering))
     found = scipy.optimize.minimize(
         cost, start, method="L-BFGS-B", bounds=[(-_MOST, _MOST)] * len(start),
         options={"eps": _STEP, "ftol": _ENOUGH / max(1.0, abs(cost(start))), "maxiter": 12})
-    factors = [float(f) for f in np.exp(found.x)]
-    receiver = factors[len(_SENSOR):]
-    changed = model.changed({name: factor * model.params.get(name)
-                             for name, factor in zip(_SENSOR, factors)})
-    return changed._replace(noise={name: factor * model.noise.get(name, 1.0)
-                                   for name, factor in zip(names, receiver)})
+    factors = np.exp(found.x)
+    noise, wander = receiver(factors)
+    changes = {name: float(factor) * model.params.get(name)
+               for name, factor in zip(_SENSOR, factors)}
+    for name, (sd, tau) in wander.items():
+        parameter = name.replace("gnss_", "gnss.")
+        changes[f"{parameter}_sd"] = tuple(
+            (sd * np.broadcast_to(model.params.get(f"{parameter}_sd"), 3)).tolist())
+        changes[f"{parameter}_tau"] = float(tau) * model.params.get(f"{parameter}_tau")
+    return model.changed(changes)._replace(noise={
+        name: float(factor) * model.noise.get(name, 1.0) for name, factor in noise.items()})

@@ -203,13 +203,16 @@ class Problem:
         return other
 
     def log_likelihood(self, noise: Sequence[float], walk: Sequence[float],
-                       receiver: Mapping[str, float], most: int) -> float:
+                       receiver: Mapping[str, float],
+                       wander: Mapping[str, tuple[float, float]], most: int) -> float:
         """Logarithm of the likelihood of the readings of the first ``most`` samples, linear about
         the trajectory, but for a constant.
 
         Args:
             noise, walk: factors (2,) of the noise of rates and forces and of the walks of their
                 biases. receiver: name of readings -> factor of their standard deviations.
+            wander: name of a block that is a Gauss-Markov process -> factors of its standard
+                deviation and of its correlation time.
         """
         n, count = self.size, min(most, len(self.x))
         intervals = self.intervals.copy()
@@ -222,6 +225,12 @@ class Problem:
         for name, factor in receiver.items():
             readings["whiten"][readings["kind"] == KINDS[name]] /= factor
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
+        for name, (sd, tau) in wander.items():
+            first = getattr(self.blocks, name)
+            here = slice(first, first + 3)
+            model["decay_rate"][0, here] /= tau
+            model["walk"][0, here] *= sd ** 2 / tau
+            cov[here, here] *= sd ** 2
         boxminus(self.mean, self.x[0], delta)
         _, surprise = filter_segment(
             0, count, False, self.x, delta, cov,
