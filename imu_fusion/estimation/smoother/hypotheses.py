@@ -104,7 +104,7 @@ def _wandering(found, model, name, error):
     if len(left) < _FEWEST:
         return
     white = float(_MAD * np.median(np.abs(np.diff(left, axis=0))) / np.sqrt(2.0))
-    slow = np.sqrt(max(np.mean(np.square(left)) - white ** 2, white ** 2))
+    slow = np.sqrt(np.maximum(np.mean(np.square(left), axis=0) - white ** 2, white ** 2))
     readings = found.problem.readings
     root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
     sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)

@@ -129,16 +129,19 @@ def _on_wander(result):
 
 def _on_place(result):
     """Medians of the normalised innovations of fixes that cannot be chance where a surface holds
-    the trajectory."""
+    the trajectory; or the error that was taken, as it can be the surface's as well."""
     if not result.surface or "fix" not in result.innovations:
         return
-    values = result.innovations["fix"][1]
+    values, unit = result.innovations["fix"][1], "of their standard deviations"
     middle = np.median(values, axis=0)
-    if np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values)):
+    taken = "gnss.position_error_sd" in result.adapted
+    if taken:
+        middle, unit = np.median(result.states["gnss_position_error"][0], axis=0), "m"
+    if taken or np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values)):
         yield ("the fixes lie beside the trajectory that the surface holds, by "
-               + "/".join(f"{b:+.1f}" for b in middle) + " (east/north/up) of their standard "
-               "deviations: the origin of the surface may be off, the sensor ride above it "
-               "(surface.body_height) or the fixes wander (gnss.position_error_sd)")
+               + "/".join(f"{b:+.1f}" for b in middle) + f" {unit} (east/north/up): the origin of "
+               "the surface may be off, the sensor ride above it (surface.body_height) or the "
+               "fixes wander (gnss.position_error_sd)")
 
 
 def _on_surface(result):
