@@ -21,6 +21,7 @@ _SPREAD = 1.0          # of the logarithm of a factor, before any reading: e or 
 _STEP = 0.1            # of it, between two values whose difference tells the slope
 _ENOUGH = 5.0          # of the log-likelihood, of which fits to a drive differ by thousands
 _TIMES = 0.5 * np.log(2.0) * np.arange(-3, 9)   # logarithms of factors of a correlation time
+_SLOWEST = 0.25        # of a recording: errors that are slower are an offset that none tells
 _SAMPLES = 60_000      # of the Imu, from the beginning on: ten minutes tell the noise
 
 
@@ -45,25 +46,36 @@ def fit_noise(problem: Problem, model: Model) -> Model:
         return (0.5 * float(np.sum(np.square(logs / _SPREAD)))
                 - problem.log_likelihood(factors_of(logs), _SAMPLES))
 
-    start = np.zeros(first + 2 * len(wandering))
+    most = np.full(first + 2 * len(wandering), _MOST)
+    longest = _SLOWEST * float(np.sum(problem.imu.steps))
+    for i, name in enumerate(wandering):
+        tau = model.params.get(f"{_parameter(name)}_tau")
+        most[first + 2 * i + 1] = np.clip(np.log(longest / tau), -_MOST, _MOST)
+    start = np.minimum(0.0, most)
     found = scipy.optimize.minimize(
-        cost, start, method="L-BFGS-B", bounds=[(-_MOST, _MOST)] * len(start),
+        cost, start, method="L-BFGS-B", bounds=[(-_MOST, bound) for bound in most],
         options={"eps": _STEP, "ftol": _ENOUGH / max(1.0, abs(cost(start))), "maxiter": 12}).x
     for i in range(first + 1, len(start), 2):
-        found[i] = _likely_time(cost, found, i)
+        found[i] = _likely_time(cost, found, i, most[i])
     return _with(model, factors_of(found))
 
 
-def _likely_time(cost: Callable[[np.ndarray], float], logs: np.ndarray, i: int) -> float:
+def _likely_time(cost: Callable[[np.ndarray], float], logs: np.ndarray, i: int, most: float
+                 ) -> float:
     """Logarithm of a correlation time: of its root mean square over all that are likely.
 
     A recording of a few correlation times hardly tells it, once the variance density is known; the
     variance of a mean over the recording grows with its square.
     """
-    tried = logs[i] + _TIMES
+    tried = np.unique(np.minimum(logs[i] + _TIMES, most))
     values = np.array([cost(np.where(np.arange(len(logs)) == i, log, logs)) for log in tried])
     weights = np.exp(values.min() - values)
     return float(0.5 * np.log(weights @ np.exp(2.0 * tried) / weights.sum()))
+
+
+def _parameter(block: str) -> str:
+    """What its parameters begin with."""
+    return block.replace("gnss_", "gnss.")
 
 
 def _with(model: Model, factors: NoiseFactors) -> Model:
@@ -71,7 +83,7 @@ def _with(model: Model, factors: NoiseFactors) -> Model:
     changes = {name: float(factor) * model.params.get(name)
                for name, factor in zip(_SENSOR, (*factors.noise, *factors.walk))}
     for name, (walk, tau) in factors.wander.items():
-        parameter = name.replace("gnss_", "gnss.")
+        parameter = _parameter(name)
         sd = np.broadcast_to(model.params.get(f"{parameter}_sd"), 3)
         changes[f"{parameter}_sd"] = tuple((np.sqrt(walk * tau) * sd).tolist())
         changes[f"{parameter}_tau"] = float(tau) * model.params.get(f"{parameter}_tau")
