@@ -17,12 +17,14 @@ from imu_fusion.estimation.smoother.measurements.registry import KINDS
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
 _MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
@@ -47,6 +49,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     Args:
         found: under ``model``. smooth: a model -> its Attempt.
     """
+    given = model.params.to_mapping()
+    found, model = _deep_landing(found, model, smooth)
     if contradicted(found.result):
         return found.result
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
@@ -59,8 +63,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
             or any(is_many(outliers) for outliers in found.result.outliers().values())):
-        return found.result
-    given = model.params.to_mapping()
+        return _adapted(found, model, given)
     for alternatives in (_delays, _velocity_delays, _wandering_fixes, _wandering_velocities,
                          _walks):
         for other in alternatives(found, model):
@@ -70,9 +73,35 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if model.params.get(name) != given[name]:
             found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
+    return _adapted(found, model, given)
+
+
+def _adapted(found, model, given):
+    """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
+
+
+def _deep_landing(found, model, smooth):
+    """Without the heights of the second in which a body sinks deeply, if it stands afterwards; not
+    compared by likelihood, as these rows are left out."""
+    fit = found.result.surface.get("landing")
+    if (found.result.jump is None or fit is None or model.params.jump.event_margin >= _SINKS
+            or not (is_doubtful(found.result) or fit.first_excess > MOST_FIRST_EXCESS)):
+        return found, model
+    other = model.changed({"jump.event_margin": _SINKS})
+    try:
+        tried = smooth(other)
+    except EstimationError:
+        return found, model
+    lands = (tried.result.jump is not None and not is_doubtful(tried.result)
+             and stands_at_touch_down(tried.result, tried.problem.constraints, other.params))
+    better = is_doubtful(found.result) or (lands and tried.result.surface["landing"].first_excess
+                                           < fit.first_excess)
+    return (tried, other) if lands and better else (found, model)
+
+
 
 
 def _delays(found, model):
