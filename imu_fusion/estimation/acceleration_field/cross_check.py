@@ -42,7 +42,7 @@ _MOST = 50.0        # beyond which evidence does not grow
 _SCALE = 1e-3       # of what it feels: no accelerometer is truer
 _SHARE = 1e-3       # of a channel's reading that must be left over for a check of it
 _FAR_BETTER = 10.0  # times smaller variances of a and alpha
-_EXCITING = 30.0
+_EXCITING = 20.0
 _LEFT = 0.2
 _FORGET = 0.1       # of a sample's evidence, by one in which a moving sensor agrees
 
