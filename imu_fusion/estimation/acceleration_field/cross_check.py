@@ -42,8 +42,8 @@ _MOST = 50.0        # beyond which evidence does not grow
 _SCALE = 1e-3       # of what it feels: no accelerometer is truer
 _SHARE = 1e-3       # of a channel's reading that must be left over for a check of it
 _FAR_BETTER = 10.0  # times smaller variances of a and alpha
-_EXCITING = 20.0
-_LEFT = 0.2
+_EXCITING = 20.0    # times the noise: what turning must make of readings to tell of the mounting
+_LEFT = 0.2         # of the sds of a mounting, to which linearised rows may find it
 _FORGET = 0.1       # of a sample's evidence, by one in which a moving sensor agrees
 
 
@@ -247,7 +247,9 @@ def linearise_well(state, p, channels, at, work):
 
 @njit
 def learns_mounting(state, p, channels, at, work):
-    """Whether a sample tells of the mounting."""
+    """Whether a sample tells of the mounting: where a body hardly turns, the rows of its states
+    change with the noise of the state that they are linearised at, and would seem to. Beyond a
+    share of what was known of it, errors of the linearisation would, too."""
     if work.is_settled[0]:
         return False
     omega, alpha = at[OMEGA:ALPHA], at[ALPHA:ALPHA + 3]

@@ -138,39 +138,50 @@ def leave_rate_out(channels, work):
 
 
 @njit
-def _squares(state, p, channels, reading, at, work):
-    """The :class:`Squares` of a sample: a and alpha are eliminated, biases and mounting count with
-    their covariance."""
-    x, cov, fit, m = state.x, state.cov, work.fit, len(channels)
-    for attempt in range(2):    # then where a and alpha of the sample are
+def _linearise_at_fit(state, p, channels, reading, at, work):
+    """Linearise where a and alpha of the sample are, and put its innovations into ``work``."""
+    fit = work.fit
+    for attempt in range(2):
         linearise(channels, at, work)
-        for c in range(m):
+        for c in range(len(channels)):
             work.innovation[c] = 0.0
             if fit.used[c]:
                 work.innovation[c] = innovation_of(
                     reading[c], work.expected[c], work.entries[c], work.touched[c], work.row[c],
-                    x, at)
+                    state.x, at)
         if attempt == 0:
             for i in range(3):
-                for c in range(m):
+                for c in range(len(channels)):
                     at[ACC + i] += fit.solve[i, c] * work.innovation[c]
                     at[ALPHA + i] += fit.solve[3 + i, c] * work.innovation[c] / p.radius
-    count = fit.redundancy[0] + 6
+
+
+@njit
+def _shared(state, work, c, d):
+    """Covariance of what biases and mounting make of the readings of channels c and d."""
+    value = 0.0
+    for k in range(9, work.entries[c]):
+        for j in range(9, work.entries[d]):
+            value += (work.row[c, k] * work.row[d, j]
+                      * state.cov[work.touched[c, k], work.touched[d, j]])
+    return value
+
+
+@njit
+def _squares(state, p, channels, reading, at, work):
+    """The :class:`Squares` of a sample: a and alpha are eliminated, biases and mounting count with
+    their covariance."""
+    _linearise_at_fit(state, p, channels, reading, at, work)
+    used = np.flatnonzero(work.fit.used)
+    count = len(used)
     total, linear, squares = np.zeros((count, count)), np.zeros((count, 6)), np.zeros((count, 6))
     left = np.empty(count)
-    used = np.empty(count, np.int64)
-    count = 0
-    for c in range(m):
-        if fit.used[c]:
-            used[count] = c
-            count += 1
     noisiness = factor(state.adaptation[0].noise)
     u, r = work.scratch[0], work.scratch[1]
     for a in range(count):
         c = used[a]
         mounted(channels[c], at, u, r)
         for i in range(3):
-            j = (i + 1) % 3
             linear[a, i] = work.row[c, 3 + i] / p.radius
             linear[a, 3 + i] = work.row[c, 6 + i]
             squares[a, i] = u[i] * r[i]
@@ -179,22 +190,15 @@ def _squares(state, p, channels, reading, at, work):
         squares[a, 5] = u[1] * r[2] + u[2] * r[1]
         left[a] = work.innovation[c]
         for b in range(a, count):
-            d = used[b]
-            value = 0.0
-            for k in range(9, work.entries[c]):
-                for l in range(9, work.entries[d]):
-                    value += (work.row[c, k] * work.row[d, l]
-                              * cov[work.touched[c, k], work.touched[d, l]])
-            total[a, b] = value
-            total[b, a] = value
+            total[a, b] = total[b, a] = _shared(state, work, c, used[b])
         total[a, a] += noisiness * noise_variance(channels[c], p)
-    left += squares @ _products(x[OMEGA:ALPHA])
+    left += squares @ _products(state.x[OMEGA:ALPHA])
     weight = np.ascontiguousarray(np.linalg.inv(total))
     against = weight @ linear
     weight -= against @ np.linalg.solve(linear.T @ against, against.T.copy())
     weighted = weight @ squares
-    return Squares(squares.T @ weighted, weighted.T @ left, left @ weight @ left,
-                   fit.redundancy[0])
+    return Squares(squares.T @ weighted, weighted.T @ left, float(left @ weight @ left),
+                   work.fit.redundancy[0])
 
 
 @njit

@@ -134,8 +134,11 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, st
         readings: (n, m), NaN for missing channels.
     """
     at = np.empty((0, len(start.x)))
+    vague = 0
     for iteration in range(params.iteration.max):
         found = smooth_once(params, array, start, stamp, readings, at)
+        # Where the filter did not know the rate, iterations may settle on the wrong sign of it.
+        vague = max(vague, int(found.last.adaptation["vague"][0]))
         if iteration > 0:
             moved = parts(found.mean).omega - parts(at).omega
             if np.all(moved ** 2 <= 1e-6 * parts(np.einsum("nii->ni", found.cov)).omega):
@@ -144,6 +147,7 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, st
     rows = np.empty(len(stamp), ROW)
     _put_smoothed(kernel_params(params, array), array.channels, stamp, readings, found.used,
                   found.mean, found.cov, start.quat.copy(), rows)
+    found.last.adaptation["vague"] = vague
     return rows, found.last
 
 
