@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
-from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
+from imu_fusion.nodes.flow import END, NAP_PATIENT, Flow, reliable_qos, sensor_qos
 from imu_fusion.signals import end_after
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
@@ -123,7 +123,7 @@ class SmootherNode(Node):
         self._stream = SmootherStream(smoothing_params, p.memory_limit * 1e6,
                                       self.get_logger().warning)
         self._at_end = p.smooth_at_end
-        self._flow = Flow(self, on_begin=self._on_begin)
+        self._flow = Flow(self, on_begin=self._on_begin, nap=NAP_PATIENT)
         self._source = self._flow.source
         self.problems = self._flow.problems
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()

@@ -245,6 +245,7 @@ class OrientationStream(Stream):
     """
 
     same_frame = one_clock = (IMU_TOPIC, MAG_TOPIC)
+    answered = (IMU_TOPIC,)
 
     def __init__(self, params: OrientationParams = OrientationParams(),
                  output: OrientationOutputParams = OrientationOutputParams(),
