@@ -30,7 +30,7 @@ from imu_fusion.batch import process
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 
-SECONDS = 4.0  # of recorded time
+SECONDS = 2.0  # of recorded time
 PATIENCE = 60.0  # s, for a session to end
 ESTIMATORS = ("orientation_estimator", "acceleration_field_estimator", "smoother")
 BOTH = ("recorder", *ESTIMATORS)
@@ -218,21 +218,21 @@ def situations():
     at_once, nobody = {"recorder": "at once"}, {"wait_for": ()}
     yield Situation("one after the other", 20, options=at_once)
     yield Situation("a busy process on each core", 20, options=at_once, beside=busy)
-    yield Situation("no names to wait for", 40, options=nobody)
-    yield Situation("no names to wait for, busy cores", 20, options=nobody, beside=busy)
-    yield Situation("no names to wait for, recorder at once", 10, options=at_once | nobody | {
+    yield Situation("no names to wait for", 10, options=nobody)
+    yield Situation("no names to wait for, busy cores", 5, options=nobody, beside=busy)
+    yield Situation("no names to wait for, recorder at once", 5, options=at_once | nobody | {
         "rate": 1.0})
-    yield Situation("a second publisher of imu/data_raw", 3, beside=(DRIVER,))
-    yield Situation("the recorder joins late", 3, options={
-        "rate": 0.5, "wait_for": ESTIMATORS, "recorder": "late"})
-    slowly = {"rate": 0.5}  # a node starts within 2 s, on idle cores
+    yield Situation("a second publisher of imu/data_raw", 2, beside=(DRIVER,))
+    yield Situation("the recorder joins late", 2, options={
+        "rate": 0.25, "wait_for": ESTIMATORS, "recorder": "late"})
+    slowly = {"rate": 0.25}  # a node starts within 2 s, on idle cores
     for node in ("orientation_estimator", "acceleration_field_estimator", "smoother", "recorder"):
         for how, said in ((signal.SIGINT, "stopped"), (signal.SIGKILL, "kill -9")):
-            yield Situation(f"{node}: {said}, started again", 3, disturb(node, how, True),
+            yield Situation(f"{node}: {said}, started again", 1, disturb(node, how, True),
                             slowly)
-    yield Situation("replayer: stopped", 3, disturb("replayer", signal.SIGINT, False),
+    yield Situation("replayer: stopped", 1, disturb("replayer", signal.SIGINT, False),
                     slowly | {"stopped": True})
-    yield Situation("replayer: kill -9", 3, disturb("replayer", signal.SIGKILL, False), slowly)
+    yield Situation("replayer: kill -9", 1, disturb("replayer", signal.SIGKILL, False), slowly)
 
 
 def run(situation, expected, folder):
@@ -302,7 +302,7 @@ def main(part="", count=None):
             f"of {', '.join(ESTIMATORS)}", "s per session", "silent"], rows,
             f"`python -m benchmarks.flow`: {SECONDS:g} s of four accelerometers at 1 kHz, Imu and "
             f"magnetometer at 200 Hz and fixes at 10 Hz, {total} messages to be recorded in each "
-            "session; at rate 0 where nothing is done to nodes, else in real time. In brackets: "
+            "session; at rate 0 where nothing is done to nodes, else slower than real time. In brackets: "
             "how often. Exit code 3 says that something is missing, 130 and -9 are ours. A recorder "
             "tells numbers only where it knows them: not what a vanished node would have sent.")
 

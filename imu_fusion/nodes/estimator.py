@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
-from imu_fusion.nodes.flow import Flow, reliable_qos, sensor_qos
+from imu_fusion.nodes.flow import NAP_LIVE, Flow, reliable_qos, sensor_qos
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.stream import EstimatorNodeParams, Messages, Stream
 
@@ -30,7 +30,8 @@ class EstimatorNode(Node):
     def attach(self, stream: Stream, outputs: Mapping[str, str]) -> None:
         """Subscribe to the stream's inputs and advertise ``outputs`` (topic to type name)."""
         self._stream: Any = stream  # of the kind that the subclass has made
-        self._flow = Flow(self, relays=True)
+        woken_by = stream.answered or stream.inputs.keys()
+        self._flow = Flow(self, relays=True, nap=NAP_LIVE if len(woken_by) > 1 else 0.0)
         self.problems = self._flow.problems
         self._outputs = {topic: self._flow.output(output_class(msgtype), topic)
                          for topic, msgtype in outputs.items()}
@@ -38,7 +39,8 @@ class EstimatorNode(Node):
             self.params(EstimatorNodeParams).qos]()
         self._names = {}  # resolved name -> ours
         for topic, kind in stream.inputs.items():
-            taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos)
+            taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos,
+                                     topic in woken_by)
             self._names[taken.topic] = topic
         self.start_diagnostics("samples", self._status)
 

@@ -11,7 +11,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
 from imu_fusion.nodes.base import IDLE, Node, message_class
-from imu_fusion.nodes.flow import DEPTH, NEXT, Flow, steady_timer
+from imu_fusion.nodes.flow import DEPTH, NAP_LIVE, NAP_PATIENT, NEXT, Flow, steady_timer
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.losses import write_losses
@@ -87,6 +87,7 @@ class Recorder(Node):
         self._is_wanted = not p.whole
         # Under use_sim_time nothing is asked for before there is a time to record it at.
         self._flow = Flow(self, on_begin=self._on_begin,
+                          nap=NAP_LIVE if self._sim_time else NAP_PATIENT,
                           hold=lambda: self._sim_time and not self._now())
         self.problems = self._flow.problems
         self._inputs = self._flow.sink.inputs

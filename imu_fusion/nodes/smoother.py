@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
-from imu_fusion.nodes.flow import END, Flow, reliable_qos, sensor_qos
+from imu_fusion.nodes.flow import END, NAP_PATIENT, Flow, reliable_qos, sensor_qos
 from imu_fusion.signals import end_after
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
@@ -123,7 +123,7 @@ class SmootherNode(Node):
         self._stream = SmootherStream(smoothing_params, p.memory_limit * 1e6,
                                       self.get_logger().warning)
         self._at_end = p.smooth_at_end
-        self._flow = Flow(self, on_begin=self._on_begin)
+        self._flow = Flow(self, on_begin=self._on_begin, nap=NAP_PATIENT)
         self._source = self._flow.source
         self.problems = self._flow.problems
         qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()
@@ -223,7 +223,7 @@ class SmootherNode(Node):
             self.get_logger().info(result)
             return
         _, outcome = self._result = result
-        message = "; ".join([outcome.summary, *outcome.remarks])
+        message = "; ".join([outcome.summary, *outcome.remarks, *self._left_out()])
         self.get_logger().info(message)
         self._answer.set_result((True, message))
 
@@ -261,11 +261,17 @@ class SmootherNode(Node):
         self._stream.reset()
         return "the collection is empty"
 
+    def _left_out(self):
+        """Texts on the samples of the collection that were not used."""
+        return [f"{topic}: {count} samples left out: {why}" for topic in self._stream.inputs
+                for why, count in self._stream.refused(topic).items()]
+
     def _status(self):
         stream = self._stream
         values: dict[str, float] = {f"{topic} collected": n for topic, n in stream.counts().items()}
-        values |= {f"{topic} {why}": n for topic in stream.inputs
-                   for why, n in stream.refused(topic).items()}
+        left_out = {f"{topic} {why}": n for topic in stream.inputs
+                    for why, n in stream.refused(topic).items()}
+        values |= left_out
         values |= {"megabytes": round(stream.bytes / 1e6, 1), "dropped": stream.dropped}
         if stream.dropped:
             return DiagnosticStatus.ERROR, "memory_limit reached, samples are dropped", values
@@ -273,4 +279,6 @@ class SmootherNode(Node):
             return DiagnosticStatus.OK, "smoothing", values
         if self._result is not None or self._messages is not None:
             return DiagnosticStatus.OK, "publishing", values
+        if left_out:
+            return DiagnosticStatus.WARN, "collecting; samples were left out", values
         return DiagnosticStatus.OK, "collecting", values

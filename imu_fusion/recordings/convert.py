@@ -42,7 +42,8 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
 
     Args:
         source, description: see there. With accelerometers of an array in the description,
-            ``<out>.yaml`` becomes the parameter file of their estimator.
+            ``<out>.yaml`` becomes the parameter file of their estimator, if it tells where they
+            are; ``<out>_parameters.yaml`` if the description itself is called so.
         out: rosbag2 directory to write. overwrite: replace it, and the parameter file.
         topics: those to keep, by either name; all, if empty. remap: names of ours to those in the
             source.
@@ -57,10 +58,16 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
     refuse_source(source, out)
     if description is not None:
         refuse_source(description, out)
+        if Path(description).resolve() == parameter_file.resolve():
+            parameter_file = out.with_name(out.name + "_parameters.yaml")
     with open_bag(source, description, remap) as reader:
         text = ""
         array = None if description is None else _array(description)
-        if description is not None and array is not None:
+        if array is not None and not any("position" in own for own in array.own.values()):
+            reader.warnings.append(f"{description}: no 'position' of the accelerometers, which the "
+                                   "acceleration field needs; give it and convert again to have "
+                                   "its parameter file, too")
+        elif description is not None and array is not None:
             refuse_files([source, description], parameter_file)
             if parameter_file.exists() and not overwrite:
                 raise BagError(f"{parameter_file}: exists already; choose another name or "

@@ -112,13 +112,16 @@ def _conclude(reader: Reader, collectors: "Mapping[str, LogCollector | _Stamps]"
               whole: "Mapping[str, _Stretches]") -> None:
     """Look at what has been collected, and let it go."""
     reports = []
-    for name, collector in collectors.items():
-        msgtype = reader.topics[name].msgtype
-        reports.append(inspect_log(name, msgtype, collector.log())
-                       if isinstance(collector, LogCollector) else collector.report(name, msgtype))
-    imus = [report.log for report in reports if isinstance(report.log, ImuLog) and report.count]
-    for report in reports:
-        whole[report.topic].add(_with_axes(report, imus))
+    with np.errstate(over="ignore", invalid="ignore"):    # wild values are told of
+        for name, collector in collectors.items():
+            msgtype = reader.topics[name].msgtype
+            reports.append(inspect_log(name, msgtype, collector.log())
+                           if isinstance(collector, LogCollector) else
+                           collector.report(name, msgtype))
+        imus = [report.log for report in reports
+                if isinstance(report.log, ImuLog) and report.count]
+        for report in reports:
+            whole[report.topic].add(_beside(report, imus))
 
 
 class _Stretches:
@@ -203,12 +206,15 @@ def inspect_log(name: str, msgtype: str, log: Log) -> TopicReport:
                        tuple(r for r in ranges if r is not None), tuple(findings), log=log)
 
 
-def _with_axes(report, imus):
-    """Add how a magnetometer turns against the only Imu of the recording."""
-    if not isinstance(report.log, MagLog) or len(imus) != 1:
+def _beside(report, imus):
+    """Add whether a sensor has the time of the only Imu of the recording, and how a magnetometer
+    turns against it."""
+    if report.log is None or len(imus) != 1 or isinstance(report.log, ImuLog):
         return report
-    return replace(report, findings=(*report.findings,
-                                     *check_axes(imus[0], report.log, report.topic)))
+    found = checks.check_clock(report.log.stamp, imus[0].stamp, report.topic)
+    if isinstance(report.log, MagLog):
+        found += check_axes(imus[0], report.log, report.topic)
+    return replace(report, findings=(*report.findings, *found))
 
 
 class _Stamps:

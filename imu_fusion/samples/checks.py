@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_fusion.errors import shown
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
 from imu_fusion.samples.turning import check_turning
@@ -133,6 +134,19 @@ def check_stamps(stamp: np.ndarray, name: str) -> list[Finding]:
                                      f"({times.interval_s * 1e3:.4g} ms), the longest "
                                      f"{times.longest_gap_s:.3g} s"))
     return result
+
+
+def check_clock(stamp: np.ndarray, imu_stamp: np.ndarray, name: str) -> list[Finding]:
+    """A finding if a topic lies beside the Imu's time altogether: stamps (n,) and (m,) int64 ns."""
+    if len(stamp) < 2 or len(imu_stamp) < 2:
+        return []
+    first, last = int(imu_stamp.min()), int(imu_stamp.max())
+    if ((stamp >= first) & (stamp <= last)).any():
+        return []
+    ahead = (int(np.median(stamp)) - int(np.median(imu_stamp))) * 1e-9
+    return [Finding("stamp", f"{name}: no sample lies within the Imu's time; its stamps are "
+                             f"{abs(ahead):.3g} s {'later' if ahead > 0 else 'earlier'}: another "
+                             "clock, and none of it can be used with the Imu")]
 
 
 def check_finite(values: np.ndarray, name: str, quantity: str) -> list[Finding]:
@@ -308,7 +322,7 @@ def check_frames(frame_ids: Collection[str], name: str) -> list[Finding]:
     if len(named) < 2:
         return []
     return [Finding("frame", f"{name}: messages of {len(named)} frames ("
-                             + ", ".join(f"'{frame}'" for frame in named[:4])
+                             + ", ".join(f"'{shown(frame, 60)}'" for frame in named[:4])
                              + "): several sensors on one topic; give each one of its own",
                     unusable=True)]
 

@@ -50,7 +50,8 @@ class TimeParams(Parameters):
 
     column: str | None = param(None, doc="Column of the times; without one, give the rate.")
     unit: str = param("s", choices=(*units.TIME, "tick", "iso8601"), doc="Unit of the times; a "
-                      "tick lasts `tick`; a time of ISO 8601 without a zone is taken as UTC.")
+                      "tick lasts `tick`; a time of ISO 8601 without a zone is taken as UTC, "
+                      "hours alone count from midnight.")
     tick: float | None = param(None, unit="s", low=1e-9, high=1.0, doc="Length of a tick.")
     wrap: float | None = param(
         None, low=1.0, doc="Value, in the unit of the column, at which the counter begins anew, "

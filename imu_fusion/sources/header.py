@@ -7,9 +7,9 @@ from imu_fusion.sources import units
 
 # What a column measures: pattern of its name, in lower case and without its unit.
 _SENSORS = {
-    "linear": r"linear|user|without.?g",
-    "accelerometer": r"acc|force|^a[_ ]?[xyz]$|^f[xyz]$",
-    "gyroscope": r"gyr|angular|rot|omega|^g[_ ]?[xyz]$|^w[_ ]?[xyz]$|rate",
+    "linear": r"lin[eé]a|user|(without|ohne).?g|sans.?g",
+    "accelerometer": r"acc|beschl|force|^a[_ ]?[xyz]$|^g?f[_ ]?[xyz]$",
+    "gyroscope": r"gyr|angular|rot|dreh|omega|^g[_ ]?[xyz]$|^w[_ ]?[xyz]$|rate",
     "magnetometer": r"mag|^m[_ ]?[xyz]$|^b[xyz]$"}
 ONES = {
     "lat": r"lat(itude)?", "lon": r"lon(g|gitude)?|lng",
@@ -22,7 +22,10 @@ ONES = {
     "qx": r"q(uat(ernion)?)?[ _.]?x", "qy": r"q(uat(ernion)?)?[ _.]?y",
     "qz": r"q(uat(ernion)?)?[ _.]?z", "qw": r"q(uat(ernion)?)?[ _.]?w"}
 TIME = r"(packet|sample|system|sensor|micro\w*|unix|utc|gps)?[ _]?(time|timestamp|stamp|t)" \
-        r"([ _]?(stamp|s|ms|us|ns|sec|fine))?|t|i?tow|date.*|seconds.elapsed"
+        r"([ _]?(stamp|s|ms|us|ns|sec|fine))?|t|i?tow|date.*|seconds.elapsed" \
+        r"|(milli|micro|nano)s(econds)?|zeit(stempel)?|temps|tiempo|tempo" \
+        r"|.*(?<![a-z])timestamp(?![a-z]).*"
+WEEK = r"(gps)?[ _]?(week|wn)([ _]?(no|number))?"
 # Units that only one sensor has.
 _BY_UNIT = {"gyroscope": units.RATE, "accelerometer": units.ACCELERATION,
             "magnetometer": {"uT": 1.0, "nT": 1.0, "mT": 1.0}}
@@ -36,32 +39,34 @@ _SUFFIXES = {"ut": "uT", "mps": "m/s", "mps2": "m/s^2", "rads": "rad/s", "degs":
 @dataclass
 class Column:
     """What the name of a column says: ``kind`` (of a sensor or of ONES, '' for nothing known),
-    ``axis`` 0 to 2, ``unit`` as written, ``group`` what tells several sensors of a kind apart."""
+    ``axis`` 0 to 2, ``unit`` as written, ``group`` what tells several sensors of a kind apart,
+    ``low`` the name without the unit."""
 
     name: str
     kind: str = ""
     axis: int | None = None
     unit: str = ""
     group: str = ""
+    low: str = ""
 
 
-def column_of(name: str) -> Column:
-    """Read the name of a column."""
-    match = _UNIT_AT_END.match(name.strip().lstrip("#").strip())
-    base, unit = (match[1], match[2] or "") if match else (name, "")
-    low = base.lower().strip()
+def column_of(label: str, name: str, unit: str = "") -> Column:
+    """Read what stands above a column that is called ``name``; ``unit``: in a line of its own."""
+    match = _UNIT_AT_END.match(label.strip().lstrip("#").strip())
+    base, unit = (match[1], match[2] or unit) if match else (label, unit)
+    low = written = base.lower().strip()
     suffix = _SUFFIX.match(low)
     if suffix and not unit:
         low, unit = suffix[1], _SUFFIXES.get(suffix[2], suffix[2])
     for kind, pattern in ONES.items():
         if re.fullmatch(pattern, low):
-            return Column(name, kind, unit=unit)
+            return Column(name, kind, unit=unit, low=written)
     axis = _AXIS.match(low)
     if axis is None:
-        return Column(name, unit=unit)
+        return Column(name, unit=unit, low=written)
     letter = axis[2] or axis[5]
     around = (axis[4] or axis[1] + axis[3]).strip(" _.-")
     kind = next((k for k, p in _SENSORS.items() if re.search(p, low)), "")
     if not kind:    # as in "a_RS_S_x [m s^-2]", or "1X[g]" of the first of several
         kind = next((k for k, known in _BY_UNIT.items() if units.spelled(unit, known)), "")
-    return Column(name, kind, "xyz".index(letter), unit, around)
+    return Column(name, kind, "xyz".index(letter), unit, around, written)

@@ -47,7 +47,7 @@ _UNIX = (1e8, 9e9)    # s, of a clock that has been set
 _SPEED_SD = 0.5
 _ACCELERATION, _RATE, _FIELD = ("m/s^2", "m/s²"), ("rad/s",), ("µT", "μT")
 _SENSORS = {"accelerometer": _ACCELERATION, "gyroscope": _RATE, "magnetometer": _FIELD}
-_LINEAR = re.compile("linear|linéaire|lineare|without", re.IGNORECASE)
+_LINEAR = re.compile("lin[eé]a|without|ohne|sans", re.IGNORECASE)
 # Columns of a location: names, and units (exports of iOS call that of the vertical accuracy a
 # degree; it is metres).
 _LOCATION = {"latitude": ("°",), "longitude": ("°",), "height|altitude": ("m",),
@@ -62,14 +62,22 @@ class Phone:
 
     def __init__(self) -> None:
         self.pairing = Pairing()
+        self._seen: set[str] = set()
 
     def vectors(self, kind: str, stamp: np.ndarray, values: np.ndarray) -> list[Block]:
         """Samples that readings (n, 3) in SI make complete; kind: accelerometer, gyroscope or
         magnetometer."""
+        self._seen.add(kind)
         if kind == "magnetometer":
             return named({MAG_TOPIC: MagLog(stamp, values)})
         return named({IMU_TOPIC: self.pairing.add(**{
             "forces" if kind == "accelerometer" else "rates": (stamp, values)})})
+
+    def alone(self) -> str:
+        """What to say where the accelerometer or the gyroscope has no other one beside it."""
+        there = [kind for kind in ("accelerometer", "gyroscope") if kind in self._seen]
+        return f"{IMU_TOPIC} needs accelerometer and gyroscope; there is the {there[0]} alone" if (
+            len(there) == 1) else ""
 
     def finish(self) -> list[Block]:
         """What waited for more."""
@@ -117,6 +125,8 @@ class PhyphoxExport(WholeSource):
                 values = values * (1e-6 if kind == "magnetometer" else 1.0)
                 blocks += phone.vectors(kind, _stamps(sheet, time, clock), values)
         blocks += phone.finish()
+        if phone.alone():
+            self.remark(phone.alone())
         if phone.pairing.left_out and not any(block.topic == IMU_TOPIC for block in blocks):
             names = " and ".join(n for n in sheets if _kind(n, sheets[n]) in (
                 "accelerometer", "gyroscope"))
@@ -223,7 +233,8 @@ def _excel(part: str, data: bytes):
         found = reader.feed(text.encode() + b"\n")
         if found.lines:
             meta = {"Metadata Time": "time", "Metadata Device": "device"}.get(name, name)
-            yield meta, _Sheet(f"{part}, sheet {name}", reader, found)
+            yield meta, _Sheet(f"{part}, sheet {name} (Excel files of phyphox are known, others "
+                               "have to be saved as CSV)", reader, found)
 
 
 def _check_unpacked(part: str, data: bytes) -> None:
@@ -245,9 +256,11 @@ def _kind(name: str, sheet: _Sheet) -> str:
         return "location"
     if _LINEAR.search(text):
         return ""
+    # Names are in the language of the phone, or of whoever made the experiment; units are not.
+    written = {match[1] for name in sheet.names if (match := re.search(r"\(([^()]*)\)$", name))}
     for kind, stem in (("accelerometer", "acc|beschleu"), ("gyroscope", "gyr"),
                        ("magnetometer", "mag")):
-        if re.search(stem, text, re.IGNORECASE):
+        if written & set(_SENSORS[kind]) or re.search(stem, text, re.IGNORECASE):
             return kind
     return ""
 
@@ -328,6 +341,9 @@ class PhyphoxLive(Source):
                 OverflowError) as error:
             if isinstance(error, SampleError):
                 raise
+            if part.startswith("/config"):
+                raise SampleError("the answer to /config is not phyphox's; is it the phone that "
+                                  "has this address?") from None
             self.lose("answers that are not phyphox's", part[:20])
         return []
 

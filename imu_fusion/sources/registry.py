@@ -19,7 +19,7 @@ from imu_fusion.sources.source import Source
 from imu_fusion.sources.table import TableSource
 from imu_fusion.sources.tables import Tables
 from imu_fusion.sources.ulog import MAGIC, Ulog
-from imu_fusion.sources.ximu3 import Ximu3
+from imu_fusion.sources.ximu3 import Ximu3, Ximu3Csv, is_csv
 
 HEAD = 1 << 16    # bytes of each part by which a format is recognised
 Heads = Mapping[str, bytes]
@@ -33,6 +33,7 @@ class Format:
     Attributes:
         name: of the parameter ``source`` of the driver. about: in words.
         recognises: whether these are the beginnings of its files.
+        schemes: beginnings of the addresses of the transports that bring its stream.
         file, live: make the Source of a file, and of a stream, given ``platform`` and the like from
             the description; None where there is none.
     """
@@ -43,6 +44,7 @@ class Format:
     file: Callable[..., Source] | None = None
     live: Callable[..., Source] | None = None
     options: tuple[str, ...] = ()
+    schemes: tuple[str, ...] = ("serial", "tcp", "udp")
 
 
 def _csvs(heads: Heads) -> dict[str, bytes]:
@@ -60,6 +62,9 @@ def _is_phyphox(heads: Heads) -> bool:
            .endswith(".xlsx")) for part, head in heads.items()):
         return len(heads) == 1
     names = _csvs(heads)
+    if any(PurePosixPath(part).parts[-2:] == ("meta", "time.csv")
+           and re.match(rb'(\xef\xbb\xbf)?"?event"?[,;\t]', head) for part, head in heads.items()):
+        return True
     known = any(re.match(r"(accelerometer|gyroscope|raw data)$", name) for name in names)
     return known and any(re.match(rb'(\xef\xbb\xbf)?"?Time \(s\)"?[,;\t]', head)
                          for head in names.values())
@@ -79,6 +84,10 @@ def _is_ximu3(heads: Heads) -> bool:
     source = Ximu3()
     found = sum(len(block.log) for block in source.feed(head[:8192]))
     return part.lower().endswith(".ximu3") or found > 2 * sum(source.lost.values()) + 2
+
+
+def _is_ximu3_csv(heads: Heads) -> bool:
+    return any(is_csv(stem, head) for stem, head in _csvs(heads).items())
 
 
 def _starts(*beginnings: bytes) -> Callable[[Heads], bool]:
@@ -107,9 +116,10 @@ def _describe_themselves(heads: Heads) -> bool:
 
 FORMATS = {known.name: known for known in (
     Format("phyphox", "phyphox, a phone's sensors (CSV or Excel, or its remote interface)",
-           _is_phyphox, PhyphoxExport, PhyphoxLive),
+           _is_phyphox, PhyphoxExport, PhyphoxLive, schemes=("http",)),
     Format("sensor_logger", "Sensor Logger, a phone's sensors (CSV, or pushed by HTTP)",
-           _is_sensor_logger, SensorLoggerExport, SensorLoggerPush, ("platform",)),
+           _is_sensor_logger, SensorLoggerExport, SensorLoggerPush, ("platform",),
+           ("http-push",)),
     Format("avanode_imu", "AvaNode, log of the IMU", _is_avanode_imu, AvanodeImu),
     Format("avanode_gnss", "AvaNode, log of the GNSS receiver", _starts(b"#microcontroller time"),
            AvanodeGnss),
@@ -118,6 +128,7 @@ FORMATS = {known.name: known for known in (
     Format("ubx", "u-blox UBX and NMEA of a GNSS receiver", _is_receiver, Receiver, Receiver),
     Format("nmea", "NMEA of a GNSS receiver", lambda heads: False, Receiver, Receiver),
     Format("ximu3", "x-io x-IMU3", _is_ximu3, Ximu3, Ximu3),
+    Format("ximu3_csv", "x-io x-IMU3, a session saved as CSV", _is_ximu3_csv, Ximu3Csv),
     Format("table", "table whose header names sensors, axes and units", _describe_themselves,
            Tables))}
 """By name, in the order in which they are tried."""
@@ -145,9 +156,23 @@ def live_source(name: str, description: Mapping[str, Any] | None, where: str) ->
         return TableSource(Description.from_mapping(description, where), strict=False)
     known = FORMATS.get(name)
     if known is None or known.live is None:
-        raise ParameterError(f"source '{name}' cannot be read live; there are: " + ", ".join(
+        raise ParameterError((f"source '{name}' cannot be read live" if name else
+                              "no source is given") + "; there are: " + ", ".join(
             [n for n, f in FORMATS.items() if f.live is not None] + ["table"]))
     return known.live(strict=False, **_options(known, description, where))
+
+
+def check_transport(name: str, address: str) -> None:
+    """Refuse a transport that cannot bring the stream of a format.
+
+    Raises:
+        ParameterError: names those that can.
+    """
+    schemes = FORMATS[name].schemes
+    scheme = address.partition("://")[0]
+    if scheme not in schemes and any(scheme in known.schemes for known in FORMATS.values()):
+        raise ParameterError(f"transport '{address}': source {name} comes through "
+                             + " or ".join(f"{known}://" for known in schemes))
 
 
 def file_source(known: Format, description: Mapping[str, Any] | None = None,

@@ -79,6 +79,8 @@ class SensorLoggerExport(WholeSource):
         blocks += phone.finish()
         if phone.pairing.left_out:
             self.remark(f"{phone.pairing.left_out} rates without a force beside them are left out")
+        if phone.alone():
+            self.remark(phone.alone())
         if rates is not None and forces is None:
             self.remark("no acceleration with gravity: neither TotalAcceleration nor "
                         "Accelerometer and Gravity were logged")

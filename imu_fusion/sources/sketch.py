@@ -6,6 +6,7 @@ leaves nothing open needs no description.
 """
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,17 +14,24 @@ import numpy as np
 
 from imu_fusion.errors import SampleError
 from imu_fusion.sources import units
-from imu_fusion.sources.header import ONES, TIME, Column, column_of
-from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
+from imu_fusion.sources.header import ONES, TIME, WEEK, Column, column_of
+from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, decoded, is_number
+from imu_fusion.sources.times import NANOSECONDS, calendar, is_calendar
 
 _LINES = 3000           # that are looked at
 _FIELD = (15e-6, 80e-6)  # T, of the Earth, with room
 _GRAVITY = (0.85, 1.15)  # of standard gravity, of a sensor at rest
 _SINCE_START = 1e8      # s, three years: times below do not count from 1970
+_OUR_YEARS = 9e8, 4e9   # s, since 1970
+_COUNTERS = tuple(2.0 ** bits for bits in (16, 24, 32))    # at which they begin anew
+_WEEKS = 1000, 10_000   # since 1980
+_WEEK = 604_800.0       # s
 _COUNTS = 50.0          # of whole numbers with a greater norm: counts of a converter
 
 _LEAST_TURN = 0.3       # rad, that tells in which unit a gyroscope is
 _WELL = 0.9             # share of what turned that a gyroscope explains
+_OTHER_UNITS = ("-", "a.u.", "local_flux", "degc", "celsius", "pa", "hpa", "kpa", "v", "mv", "%",
+                "no_units")
 # Times of some loggers, by the name of their column: unit, s per tick.
 _KNOWN_TIMES = {"sampletimefine": ("tick", 1e-4)}    # Xsens MT Manager
 
@@ -86,8 +94,8 @@ def sketch(data: bytes, where: str) -> Sketch:
     Raises:
         SampleError: this is no table of numbers.
     """
-    lines = [line.rstrip("\r") for line in
-             data.decode("utf-8-sig", "replace").split("\n")[:_LINES]]
+    lines = [decoded(line.rstrip(b"\r")) for line in
+             data.removeprefix(b"\xef\xbb\xbf").split(b"\n")[:_LINES]]
     if len(data) and not data.endswith(b"\n") and len(lines) > 2:
         lines.pop()    # perhaps cut in the middle
     best = max((_layout(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "space")
@@ -103,26 +111,32 @@ def sketch(data: bytes, where: str) -> Sketch:
             result.content[key] = value
     values = {name: np.array([_value(row[k], best.decimal) for row in best.rows])
               for k, name in enumerate(best.names)}
-    columns = [column_of(name) if best.header else Column(name) for name in best.names]
-    _sketch_time(result, columns, values, {name: best.rows[0][k]
+    columns = [column_of(label, name, unit) for label, name, unit in zip(
+        best.labels or [""] * len(best.names), best.names, best.units or [""] * len(best.names))]
+    _sketch_time(result, columns, values, {name: [row[k] for row in best.rows]
                                            for k, name in enumerate(best.names)})
-    if not best.header:
+    if not best.labels:
         columns = _by_values(columns, values, result.content["time"].get("column"))
     _sketch_vectors(result, columns, values)
     _sketch_gnss(result, columns, values)
     used = set(_used(result.content))
-    result.unused = [c.name for c in columns if c.name not in used]
+    result.unused = [c.name for c in columns if c.name and c.name not in used]
     return result
 
 
 @dataclass
 class _Layout:
+    """``names`` are those of the description; ``labels`` and ``units`` what stands above the
+    columns, empty where nothing does."""
+
     score: float
     delimiter: str = ","
     decimal: str = "."
     skip: int = 0
     header: bool = True
     names: list[str] = field(default_factory=list)
+    labels: list[str] = field(default_factory=list)
+    units: list[str] = field(default_factory=list)
     rows: list[list[str]] = field(default_factory=list)
 
 
@@ -143,69 +157,146 @@ def _layout(lines: list[str], delimiter: str, decimal: str) -> _Layout:
     like = [(k, cells) for k, cells in rows if len(cells) > 1 and numeric[k] >= 0.5 * len(cells)]
     if len(like) < 3:
         return _Layout(0.0)
-    width = int(np.median([len(cells) for _, cells in like]))
+    width = Counter(len(cells) for _, cells in like).most_common(1)[0][0]
     body = [(k, cells) for k, cells in like if len(cells) == width]
     first = body[0][0]
     above = [(k, cells) for k, cells in rows if k < first]
-    header = bool(above) and len(above[-1][1]) == width
-    names = above[-1][1] if header else [str(i + 1) for i in range(width)]
-    skip = above[-1][0] if header else (above[-1][0] + 1 if above else 0)
     score = float(sum(numeric[k] for k, _ in body)) / len(rows)
-    if 2 * len(body) < len(rows) - (len(above) if header else 0):
+    layout = _Layout(score, delimiter, decimal, rows=[cells for _, cells in body])
+    _read_header(layout, above, width)
+    if 2 * len(body) < len(rows) - (len(above) if layout.header else 0):
         return _Layout(0.0)
-    return _Layout(score, delimiter, decimal, skip, header, names, [cells for _, cells in body])
+    return layout
 
 
-def _sketch_time(result, columns, values, first):
-    """The time column: by name, else the first that rises throughout."""
-    rising = [c for c in columns if len(values[c.name]) > 1
-              and (np.diff(values[c.name]) >= 0).all() and np.ptp(values[c.name]) > 0]
-    named_so = [c for c in columns if not c.kind and re.fullmatch(
-        TIME, c.name.split("[")[0].split("(")[0].strip(' "#').lower())]
-    calendar = [c for c in columns if re.match(r"\d{4}[-/]\d\d[-/]\d\d[T ]\d", first[c.name])]
-    if calendar:
-        result.content["time"] = {"column": calendar[0].name, "unit": "iso8601"}
+def _read_header(layout: _Layout, above: list[tuple[int, list[str]]], width: int) -> None:
+    """Names of the columns from the lines above them, the last of which may hold units."""
+    open_end = all(not row[-1] for row in layout.rows)    # each row ends with a delimiter
+
+    def of_columns(line):
+        """The cells of a line that has one for each column; else none."""
+        cells = above[line][1] if len(above) >= -line else []
+        fits = len(cells) == width or (open_end and len(cells) == width - 1)
+        return [*cells, *[""] * (width - len(cells))] if fits else []
+
+    layout.skip = above[-1][0] if above else 0
+    has_units = bool(above) and all(_is_unit(cell) for cell in above[-1][1])
+    layout.labels = of_columns(-2 if has_units else -1)
+    if has_units:
+        layout.units = [_bare(cell) for cell in of_columns(-1)]
+    # The reader takes names from the line above the rows alone.
+    layout.header = bool(layout.labels) and not has_units
+    layout.names = (layout.labels if layout.header else [str(k + 1) for k in range(width)])
+    layout.skip += bool(above) and not layout.header
+
+
+def _bare(unit: str) -> str:
+    """A unit without brackets around it."""
+    return unit[1:-1] if re.fullmatch(r"\(.*\)|\[.*\]", unit) else unit
+
+
+def _is_unit(text: str) -> bool:
+    text = _bare(text)
+    return not text or text.lower() in _OTHER_UNITS or any(
+        units.spelled(text, known) for known in (
+            units.ACCELERATION, units.RATE, units.FIELD, units.LENGTH, units.SPEED, units.ANGLE,
+            units.TIME))
+
+
+def _sketch_time(result, columns, values, texts):
+    """The time column: by name or unit, else the first that rises throughout."""
+    dates = [c for c in columns if is_calendar(texts[c.name][0])]
+    if dates:
+        _sketch_dates(result, dates[0].name, texts[dates[0].name], values)
         return
+    turns = {c.name: _turn(values[c.name]) for c in columns}
+    rising = [c for c in columns if turns[c.name] is not None]
+    named_so = [c for c in columns if not c.kind and np.isfinite(values[c.name]).any() and (
+        re.fullmatch(TIME, c.low) or (c in rising and units.spelled(c.unit, units.TIME)))]
     chosen = ([c for c in named_so if c in rising] or named_so or rising or [None])[0]
     if chosen is None:
         result.content["time"] = {"rate": 100.0}
         result.doubts["time"] = "no column of times is found, the rate is not known"
         return
     step = float(np.nanmedian(np.abs(np.diff(values[chosen.name]))))
-    start = float(np.nanmax(values[chosen.name]))
-    unit = units.spelled(chosen.unit, units.TIME)
-    suffix = re.search(r"[ _](s|ms|us|ns|sec)$|(nano|micro|milli)", chosen.name.lower())
-    known = unit or (suffix and {"nano": "ns", "micro": "us", "milli": "ms", "sec": "s"}.get(
-        suffix[1] or suffix[2], suffix[1]))
-    logger = _KNOWN_TIMES.get(chosen.name.lower())
+    latest = float(np.nanmax(values[chosen.name]))
+    logger = _KNOWN_TIMES.get(chosen.low)
     if logger:
         result.content["time"] = {"column": chosen.name, "unit": logger[0], "tick": logger[1],
                                   "wrap": 2.0 ** 32, "start": EPOCH * 1e-9}
         result.remarks["time"] = f"{1 / (step * logger[1]):.4g} Hz" if step else ""
         return
-    guessed = known or _time_unit(step, start)
-    result.content["time"] = {"column": chosen.name, "unit": guessed}
-    if start * 10.0 ** (units.TIME[guessed] - 9) < _SINCE_START:
-        result.content["time"]["start"] = EPOCH * 1e-9    # counted from some start
+    known = _named_time_unit(chosen) or (_epoch_unit(latest) if chosen in named_so else None)
+    unit = known or _time_unit(step, latest)
+    time = result.content["time"] = {"column": chosen.name, "unit": unit}
+    seconds = 10.0 ** (units.TIME[unit] - 9)
+    week = next((c.name for c in columns if re.fullmatch(WEEK, c.low) and (
+        np.ptp(values[c.name]) <= 1 and _WEEKS[0] < values[c.name][0] < _WEEKS[1])), None)
+    if week is not None and latest * seconds <= _WEEK:
+        time["week"] = week
+    elif latest * seconds < _SINCE_START:
+        time["start"] = EPOCH * 1e-9    # counted from some start
+    rate = 1 / (step * seconds) if step else np.nan
     if not known or chosen not in named_so:
-        result.doubts["time"] = (f"steps of {step:g} would be "
-                                 f"{1 / (step * 10.0 ** (units.TIME[guessed] - 9)):.4g} Hz"
-                                 if step else "the times stand still")
+        result.doubts["time"] = (f"steps of {step:g} would be {rate:.4g} Hz" if step else
+                                 "the times stand still")
     elif step:
-        rate = 1 / (step * 10.0 ** (units.TIME[guessed] - 9))
         result.remarks["time"] = f"{rate:.4g} Hz"
         if not 0.05 <= rate <= 100e3:
             result.doubts["time"] = f"{rate:.4g} Hz, is the unit right?"
+    if turns[chosen.name]:
+        time["wrap"] = turns[chosen.name]
+        result.doubts["time"] = f"{rate:.4g} Hz; a counter that begins anew"
+    elif chosen not in rising:
+        result.doubts["time"] = f"{rate:.4g} Hz; the times fall back, or stand still"
+
+
+def _sketch_dates(result, name, texts, values):
+    """Times that are written out; their seconds go to ``values``."""
+    result.content["time"] = {"column": name, "unit": "iso8601"}
+    try:
+        since = np.array([calendar(text.strip()) for text in texts], dtype=np.int64)
+    except ValueError:
+        result.doubts["time"] = "not all of them are times"
+        return
+    values[name] = (since - since[0]) / NANOSECONDS
+    if since[0] < _SINCE_START * NANOSECONDS:
+        result.content["time"]["start"] = EPOCH * 1e-9
+        result.doubts["time"] = "hours without a date"
+
+
+def _turn(values):
+    """Where a counter begins anew of whose values the rest rise: 0 if nowhere, None if they do not
+    rise."""
+    step = np.diff(values)
+    if not len(step) or not np.ptp(values) > 0 or not np.isfinite(values).all():
+        return None
+    falls = step[step < 0]
+    if not len(falls):
+        return 0
+    usual = float(np.median(step[step >= 0])) if len(falls) < 0.1 * len(step) else 0.0
+    return next((size for size in _COUNTERS if values.max() < size and usual > 0 and (
+        (falls + size > 0) & (falls + size < 100 * usual)).all()), None)
+
+
+def _named_time_unit(column):
+    """The unit that the name of a column of times tells, or None."""
+    unit = units.spelled(column.unit, units.TIME)
+    suffix = re.search(r"[ _](s|ms|us|ns|sec)$|(nano|micro|milli)", column.low)
+    return unit or (suffix and {"nano": "ns", "micro": "us", "milli": "ms", "sec": "s"}.get(
+        suffix[1] or suffix[2], suffix[1]))
+
+
+def _epoch_unit(latest):
+    """The unit in which a time since 1970 is of our years, or None."""
+    return next((unit for unit, power in units.TIME.items() if
+                 _OUR_YEARS[0] < latest * 10.0 ** (power - 9) < _OUR_YEARS[1]), None)
 
 
 def _time_unit(step, latest):
-    """The unit in which stamps are of our years, or else steps of usual rates."""
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
-        if latest > least:
-            return unit
-    if latest > 1e8 and step < 100:
-        return "s"
-    return "s" if step < 0.7 else "ms" if step < 300 else "us" if step < 3e5 else "ns"
+    """The unit in which times are of our years, or else steps of usual rates."""
+    return _epoch_unit(latest) or (
+        "s" if step < 0.7 else "ms" if step < 300 else "us" if step < 3e5 else "ns")
 
 
 def _by_values(columns, values, time):
@@ -216,19 +307,22 @@ def _by_values(columns, values, time):
     if not triples:
         return columns
 
-    def like_gravity(triple):
-        data = np.column_stack([values[c.name] for c in triple])
-        norm = _quiet(data)
-        fits = any(_GRAVITY[0] < norm * f / STANDARD_GRAVITY < _GRAVITY[1]
-                   for f in units.ACCELERATION.values())
-        return fits, bool((data == np.round(data)).all()) * norm
-
-    force = max(triples[:2], key=like_gravity)
+    force = max(triples[:2], key=lambda triple: _feels_gravity(triple, values))
     kinds = ("accelerometer", "gyroscope", "magnetometer")
     order = [force, *(t for t in triples if t is not force)]
     known = {c.name: Column(c.name, kind, axis) for kind, triple in zip(kinds, order)
              for axis, c in enumerate(triple)}
     return [known.get(c.name, c) for c in columns]
+
+
+def _feels_gravity(axes, values):
+    """(whether the norm at rest is that of gravity in some unit, that norm if it may be counts), by
+    which the likeliest accelerometer has the greatest."""
+    data = np.column_stack([values[c.name] for c in axes])
+    norm = _quiet(data)
+    fits = any(_GRAVITY[0] < norm * f / STANDARD_GRAVITY < _GRAVITY[1]
+               for f in units.ACCELERATION.values())
+    return fits, bool((data == np.round(data)).all()) * norm
 
 
 def _groups(columns, kind):
@@ -244,15 +338,19 @@ def _sketch_vectors(result, columns, values):
     for kind, known in (("accelerometer", units.ACCELERATION), ("gyroscope", units.RATE),
                         ("magnetometer", units.FIELD)):
         groups = _groups(columns, kind)
-        if kind == "accelerometer" and len(groups) > 1 and all(
-                re.search(r"\d", group) for group in groups):
-            _sketch_array(result, groups)
+        named_so = bool(groups)
+        if kind == "accelerometer" and not named_so:    # whatever they are called: front, back
+            groups = {group: axes for group, axes in _groups(columns, "").items()
+                      if _feels_gravity(axes, values)[0]}
+        if kind == "accelerometer" and len(groups) > 1 and not (
+                named_so and not all(re.search(r"\d", group) for group in groups)):
+            _sketch_array(result, groups, values)
             continue
         if not groups:
             continue
-        group, axes = next(iter(groups.items()))
-        if len(groups) > 1:
-            result.doubts[kind] = f"one of {len(groups)}"
+        axes = next(iter(groups.values()))
+        if kind == "accelerometer":
+            axes = max(groups.values(), key=lambda group: _feels_gravity(group, values))
         data = np.column_stack([values[c.name] for c in axes])
         if kind == "gyroscope":
             unit, scale, doubt = _rate_unit(axes[0].unit, data, _turned(columns, values),
@@ -262,20 +360,26 @@ def _sketch_vectors(result, columns, values):
         result.content[kind] = {"columns": [c.name for c in axes], "unit": unit}
         if scale != 1.0:
             result.content[kind]["scale"] = scale
+        if len(groups) > 1:
+            doubt = f"one of {len(groups)}" + (f"; {doubt}" if doubt else "")
         if doubt:
             result.doubts[kind] = doubt
         elif kind == "accelerometer":
             _remark_gravity(result, data * known[unit] / scale)
 
 
-def _sketch_array(result, groups):
+def _sketch_array(result, groups, values):
     array = {}
     for group, axes in groups.items():
-        name = "a" + re.sub(r"\W", "", group)
-        array[name] = {"columns": [c.name for c in axes],
-                       "unit": units.spelled(axes[0].unit, units.ACCELERATION) or "m/s^2",
-                       "position": [0.0, 0.0, 0.0]}
-        result.doubts[f"accelerometers.{name}"] = "where it sits, and its axes"
+        word = re.sub(r"\W", "", group)
+        name = word if word.isidentifier() and word.isascii() else "a" + word
+        unit, scale, doubt = _unit_of("accelerometer", axes[0].unit, units.ACCELERATION,
+                                      np.column_stack([values[c.name] for c in axes]))
+        array[name] = {"columns": [c.name for c in axes], "unit": unit}
+        if scale != 1.0:
+            array[name]["scale"] = scale
+        result.doubts[f"accelerometers.{name}"] = "; ".join(filter(None, [
+            doubt, "add position: [x, y, z] in m, and axes where they are not those of the body"]))
     result.content["accelerometers"] = array
 
 
@@ -312,7 +416,7 @@ def _unit_of(kind, written, known, data):
     if bool((data == np.round(data)).all()) and rest > _COUNTS:
         scale = float(2 ** round(np.log2(rest)))
         return "g", scale, f"counts; {rest:g} at rest taken as about 1 g"
-    return "m/s^2", 1.0, f"unit not named; norm at rest {rest:.4g}"
+    return "m/s^2", 1.0, f"unit not named; norm at rest {rest:.4g}, which is gravity in none"
 
 
 def _remark_gravity(result, acc):
@@ -329,10 +433,11 @@ def _remark_gravity(result, acc):
 def _seconds(result, values):
     """Times in s, or None."""
     time = result.content["time"]
-    if "column" not in time or time["unit"] == "iso8601":
+    if "column" not in time:
         return None
-    factor = time.get("tick") or 10.0 ** (units.TIME[time["unit"]] - 9)
-    return values[time["column"]] * factor
+    factor = time.get("tick") or 10.0 ** (units.TIME.get(time["unit"], 9) - 9)
+    turns = np.cumsum(np.diff(values[time["column"]], prepend=0.0) < 0)
+    return (values[time["column"]] + turns * time.get("wrap", 0.0)) * factor
 
 
 def _turned(columns, values):

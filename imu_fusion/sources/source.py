@@ -118,7 +118,16 @@ class Lines:
         self._number += 1
         if self._number == 1:
             line = line.removeprefix(b"\xef\xbb\xbf")
-        return self._number, line.rstrip(b"\r").decode("utf-8", "replace")
+        return self._number, decoded(line.rstrip(b"\r"))
+
+
+def decoded(line: bytes) -> str:
+    """The text of a line: UTF-8, or else the code page of Windows in the west, in which a degree
+    sign is one byte."""
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("cp1252", "replace")
 
 
 class WholeSource(Source):

@@ -2,10 +2,8 @@
 :class:`~imu_fusion.sources.description.Description` says."""
 
 import csv
-import re
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any, NamedTuple
 
@@ -46,8 +44,8 @@ from imu_fusion.sources.source import (
     named,
     numbers,
 )
+from imu_fusion.sources.times import NANOSECONDS, calendar
 
-NANOSECONDS = 1_000_000_000
 GPS_EPOCH = 315_964_800    # 1980-01-06 in Unix time
 _WEEK = 7 * 86400
 _DIGITS = 22           # of nanoseconds, with room
@@ -172,7 +170,7 @@ def _stamp(where: str, line: int, text: str, week: float, time: TimeParams) -> i
     text = text.strip()
     try:
         if time.unit == "iso8601":
-            since = _calendar(text)
+            since = calendar(text)
         else:
             # Seconds since 1970 exceed what a float tells apart in nanoseconds.
             value = Decimal(text if is_number(text) else "")
@@ -189,20 +187,6 @@ def _stamp(where: str, line: int, text: str, week: float, time: TimeParams) -> i
                           "time") from None
 
 
-_FRACTION = re.compile(r"([.,]\d+)")
-
-
-def _calendar(text: str) -> int:
-    """Nanoseconds since 1970 of a time of ISO 8601, also with a blank for the T; UTC without a
-    zone."""
-    fraction = _FRACTION.search(text)
-    whole = datetime.fromisoformat(_FRACTION.sub("", text).replace("/", "-"))
-    if whole.tzinfo is None:
-        whole = whole.replace(tzinfo=UTC)
-    part = round(Decimal("0." + fraction[1][1:]) * NANOSECONDS) if fraction else 0
-    return int(whole.timestamp()) * NANOSECONDS + part
-
-
 class TableSource(Source):
     """A table, or lines of one, as a :class:`Description` says."""
 
@@ -213,6 +197,9 @@ class TableSource(Source):
         self._count = 0       # rows, for those without times
         self._turns = 0       # how often the counter of the times began anew
         self._last: int | None = None
+        self._latest = 0      # ns, of the last row
+        self._falls = 0       # times that fell back
+        self._fall = 0, 0     # line and ns of the first one
         self._reader: TableReader | None = None
         self._where = where
 
@@ -230,6 +217,11 @@ class TableSource(Source):
         if self.strict and self._count < 2:
             raise SampleError(f"{self._where}: {self._count} rows of numbers; is skip_lines or "
                               "header right?")
+        if self._falls:
+            line, back = self._fall
+            self.remark(f"{self._falls} times fall back, the first in line {line} by "
+                        f"{back / NANOSECONDS:.6g} s, and the samples are put in order of their "
+                        "times: give time.wrap if that is a counter that began anew")
         return blocks
 
     def restart(self) -> None:
@@ -315,15 +307,23 @@ class TableSource(Source):
         turns, last = self._turns, self._last
         if time.wrap is not None:
             length = round(time.wrap * (time.tick * NANOSECONDS if time.tick is not None
-                                        else 10 ** units.TIME[time.unit]))
+                                        else 10 ** units.TIME.get(time.unit, 9)))
             for k, stamp in enumerate(stamps):
                 turns += last is not None and stamp < last - length // 2
                 last = stamp
                 stamps[k] = stamp + turns * length
         self._check(rows, stamps)
+        found = np.array(stamps, dtype=np.int64)
+        back = -np.diff(found, prepend=self._latest)
+        if (back > 0).any():
+            if not self._falls:
+                k = int(np.argmax(back > 0))
+                self._fall = rows.lines[k], int(back[k])
+            self._falls += int((back > 0).sum())
+        self._latest = stamps[-1]
         self._turns, self._last = turns, last
         self._count += len(rows.lines)
-        return np.array(stamps, dtype=np.int64)
+        return found
 
     def _check(self, rows: Rows, stamps: list[int]) -> None:
         name = self._description.table.time.column

@@ -16,6 +16,7 @@ TIME = {"s": 9, "ms": 6, "us": 3, "ns": 0}    # powers of ten to nanoseconds
 _SPELLINGS = {
     "m/s²": "m/s^2", "m/s2": "m/s^2", "m/s/s": "m/s^2", "m·s⁻²": "m/s^2", "ms-2": "m/s^2",
     "m s-2": "m/s^2", "m s^-2": "m/s^2", "mps2": "m/s^2", "ms^-2": "m/s^2", "m/sec^2": "m/s^2",
+    "m/(s^2)": "m/s^2",
     "°/s": "deg/s", "dps": "deg/s", "degps": "deg/s", "deg/sec": "deg/s", "mdps": "mdeg/s",
     "rad/sec": "rad/s", "rad s^-1": "rad/s", "rad s-1": "rad/s", "deg s^-1": "deg/s",
     "rps": "rad/s", "µt": "uT", "μt": "uT", "ut": "uT", "microtesla": "uT",

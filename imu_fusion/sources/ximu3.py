@@ -1,4 +1,5 @@
-"""x-io x-IMU3: its messages, binary and text, live or in a .ximu3 file.
+"""x-io x-IMU3: its messages, binary and text, live or in a .ximu3 file, and the CSV files that its
+software makes of one.
 
 A message ends with a line feed. A binary one begins with its letter + 0x80, then the time in
 microseconds (uint64) and single precision numbers, little endian, with 0x0A and 0xDB escaped; a
@@ -9,10 +10,12 @@ Source: x-IMU3 User Manual (x-io Technologies), "Data messages".
 """
 
 import struct
+from pathlib import PurePosixPath
 
 import numpy as np
 
 from imu_fusion.samples.logs import ImuLog, Log, MagLog
+from imu_fusion.sources.description import Description
 from imu_fusion.sources.source import (
     EPOCH,
     IMU_TOPIC,
@@ -20,13 +23,23 @@ from imu_fusion.sources.source import (
     STANDARD_GRAVITY,
     Block,
     Source,
+    WholeSource,
     is_number,
     named,
 )
+from imu_fusion.sources.table import TableSource
 
 _LONGEST = 1024    # bytes of a message
 _NUMBERS = {"I": 6, "M": 3}
 _UNIT = 50e-6      # T
+_UNIT_SAID = "the magnetometer of an x-IMU3 tells no tesla: its unit is taken as 50 uT"
+_CSV_TIME = "Timestamp (us)"
+#: Files of a session: what they hold, in which columns and unit.
+_CSV_FILES: dict[str, dict[str, tuple[slice, str, float]]] = {
+    "inertial": {"gyroscope": (slice(1, 4), "deg/s", 1.0),
+                 "accelerometer": (slice(4, 7), "g", 1.0)},
+    "magnetometer": {"magnetometer": (slice(1, 4), "T", 1.0 / _UNIT)}}
+_CSV_UNITS = {"inertial": "(deg/s)", "magnetometer": "(a.u.)"}
 
 
 class Ximu3(Source):
@@ -61,8 +74,38 @@ class Ximu3(Source):
                 logs[topic] = (MagLog(stamp, values * _UNIT) if letter == "M" else ImuLog(
                     stamp, np.radians(values[:, :3]), values[:, 3:] * STANDARD_GRAVITY))
         if found["M"]:
-            self.remark("the magnetometer of an x-IMU3 tells no tesla: its unit is taken as 50 uT")
+            self.remark(_UNIT_SAID)
         return named(logs)
+
+
+def is_csv(stem: str, head: bytes) -> bool:
+    """Whether a file called so is one of a session, by its beginning."""
+    names = _names(head)
+    return stem in _CSV_FILES and names[0] == _CSV_TIME and _CSV_UNITS[stem] in "".join(names[1:2])
+
+
+class Ximu3Csv(WholeSource):
+    """The CSV files of a session, of which those of other messages are left alone."""
+
+    def finish(self) -> list[Block]:
+        blocks: list[Block] = []
+        for part, data in self.parts.items():
+            stem = PurePosixPath(part).stem.lower()
+            if not is_csv(stem, bytes(data[:_LONGEST])):
+                continue
+            names = _names(bytes(data[:_LONGEST]))
+            table = TableSource(Description.from_mapping({
+                "time": {"column": _CSV_TIME, "unit": "us", "start": EPOCH * 1e-9},
+                **{key: {"columns": names[columns], "unit": unit, "scale": scale}
+                   for key, (columns, unit, scale) in _CSV_FILES[stem].items()}}, part))
+            blocks += table.feed(bytes(data), part) + table.finish()
+            for text in [*table.remarks, *([_UNIT_SAID] if stem == "magnetometer" else [])]:
+                self.remark(text)
+        return blocks
+
+
+def _names(head: bytes) -> list[str]:
+    return head.partition(b"\n")[0].decode("utf-8", "replace").strip().split(",")
 
 
 def _read(message: bytes) -> tuple[str, int, tuple[float, ...]] | None:

@@ -78,14 +78,15 @@ class Stream:
         calibration: of the Imu: what comes in is calibrated before anything else.
 
     Subclasses name in ``same_frame`` the topics whose axes must be parallel, in ``one_clock`` those
-    whose sensors share a clock (None: all do, see BlockMerger), and implement
-    ``restart`` (forget everything), ``use`` (samples of one epoch in, Messages out), ``flush``
-    (Messages of what is held back), and where they have something to say ``look_at`` (texts about
-    first samples), ``remarks`` and ``conclude``.
+    whose sensors share a clock (None: all do, see BlockMerger), in ``answered`` those with whose
+    samples estimates come (None: with all), and implement ``restart`` (forget everything), ``use``
+    (samples of one epoch in, Messages out), ``flush`` (Messages of what is held back), and where
+    they have something to say ``look_at`` (texts on first samples), ``remarks`` and ``conclude``.
     """
 
     same_frame: ClassVar[tuple[str, ...]] = ()
     one_clock: ClassVar[tuple[str, ...] | None] = None
+    answered: ClassVar[tuple[str, ...] | None] = None
     #: To be set before the first sample where :meth:`conclude` is to be called: what that needs
     #: is then kept.
     concludes = False

@@ -44,12 +44,12 @@ def test_rate_zero_delivers_the_stored_bytes_and_ends_by_itself(graph, bag):
 
 def test_rate_zero_loses_nothing_with_a_slow_consumer(graph, tmp_path):
     """The consumer takes nothing until its queue is full and the replayer shut."""
-    bag = write_bag(tmp_path / "long", 8000)
+    bag = write_bag(tmp_path / "long", 4000)
     sink = collector(graph)
     sink.takes = False
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0, topics=[IMU])
     out, = replayer._outputs.values()
-    graph.until(lambda: out.sent > 5000 and not out.is_open())
+    graph.until(lambda: out.sent >= 1000 and not out.is_open())
     assert "/collector" in replayer._source.waiting_for()
     sink.takes = True
     graph.until(lambda: replayer.finished)

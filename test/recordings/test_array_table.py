@@ -168,3 +168,23 @@ def test_an_existing_parameter_file_is_not_replaced_unasked(tmp_path):
     with pytest.raises(ImuFusionError, match="bag.yaml: exists already"):
         convert(source, out, file)
     assert (tmp_path / "bag.yaml").read_text() == "mine"
+
+
+def test_without_positions_there_are_the_samples_and_no_parameters(tmp_path):
+    """No table tells where its sensors sit: what describe makes of it can be converted."""
+    names = [f"{name}_{axis}" for name in ("front", "left", "top", "back") for axis in "xyz"]
+    (tmp_path / "run.csv").write_text("t_ms," + ",".join(names) + "\n" + "".join(
+        f"{i}" + ",0.01,0.02,1" * 4 + "\n" for i in range(9)))
+    for arguments in (["describe", "run.csv", "--out", "run.yaml"],
+                      ["convert", "run.csv", "run", "--description", "run.yaml"]):
+        result = CliRunner().invoke(cli.cli, [
+            str(tmp_path / word) if word.startswith("run") else word for word in arguments],
+            catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    assert "no 'position' of the accelerometers" in result.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.csv", "run.yaml"]
+    with open_bag(tmp_path / "run") as reader:
+        assert set(reader.topics) == {f"/accelerometers/{name}" for name in (
+            "front", "left", "top", "back")}
+        _, _, values = IMU.decode_many([m[3] for m in reader.messages(["/accelerometers/left"])])
+    assert values[0, IMU["linear_acceleration"]] == pytest.approx([0.01 * G, 0.02 * G, G])

@@ -49,7 +49,9 @@ def test_repair_and_report_do_not_write_over_their_source(tmp_path):
     bag = write(tmp_path / "bag", 20)
     before = contents(tmp_path)
     for arguments in (["info", str(bag), "--repair", str(bag)],
-                      ["report", str(bag), "--out", str(bag / "bag_0.mcap")]):
+                      ["report", str(bag), "--out", str(bag / "bag_0.mcap")],
+                      ["calibrate", "noise", str(bag), "--out", str(bag / "bag_0.mcap")],
+                      ["calibrate", "noise", str(bag), "--plot", str(bag / "metadata.yaml")]):
         result = CliRunner().invoke(cli, arguments)
         assert result.exit_code == 1 and "choose another name" in result.output
     assert contents(tmp_path) == before
@@ -58,11 +60,15 @@ def test_repair_and_report_do_not_write_over_their_source(tmp_path):
 def test_a_description_is_not_taken_for_the_parameter_file_that_is_made(tmp_path):
     table, description = tmp_path / "run.csv", tmp_path / "run.yaml"
     table.write_text("t,x,y,z\n0,0,0,9.8\n1,0,0,9.8\n")
-    description.write_text("time: {column: t}\naccelerometers: {a: {columns: [x, y, z]}}\n")
+    places = {"a": "[0, 0, 1]", "b": "[0, 1, 0]", "c": "[1, 0, 0]", "d": "[-1, 0, 0]"}
+    text = "time: {column: t}\naccelerometers:\n" + "".join(
+        f"  {name}: {{columns: [x, y, z], position: {place}}}\n" for name, place in places.items())
+    description.write_text(text)
     result = CliRunner().invoke(cli, ["convert", "--csv", str(description), str(table),
                                       str(tmp_path / "run"), "--overwrite"])
-    assert result.exit_code == 1 and "would be overwritten" in result.output
-    assert description.read_text().startswith("time:") and len(list(tmp_path.iterdir())) == 2
+    assert result.exit_code == 0 and "run_parameters.yaml" in result.output, result.output
+    assert description.read_text() == text
+    assert "position" in (tmp_path / "run_parameters.yaml").read_text()
 
 
 def test_a_folder_of_recordings_is_not_a_recording(tmp_path):

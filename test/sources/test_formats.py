@@ -15,9 +15,10 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.sources.gnss import Receiver
 from imu_fusion.sources.phyphox import PhyphoxExport, PhyphoxLive
+from imu_fusion.sources.registry import recognise
 from imu_fusion.sources.sensor_logger import SensorLoggerExport, SensorLoggerPush
 from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
-from imu_fusion.sources.ximu3 import Ximu3
+from imu_fusion.sources.ximu3 import Ximu3, Ximu3Csv
 from test.sources.logs import read, same, together, ulog
 from test.sources.test_splitting import escaped, nmea, solution
 
@@ -77,6 +78,28 @@ def test_x_imu3_binary_and_text_say_the_same():
     assert imu.acc[0] == pytest.approx([0.0, 4.903325, 9.80665])
 
 
+INERTIAL = (b"Timestamp (us),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
+            b"Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)\n"
+            + b"".join(b"%d,1.5,-2.5,90,0,0.5,1\n" % (10_000 * k) for k in range(9)))
+HIGH_G = b"Timestamp (us),X (g),Y (g),Z (g)\n10,0,0,1\n20,0,0,1\n"
+
+
+def test_a_session_of_an_x_imu3_is_the_same_as_csv():
+    """The files are those that x-io's own converter (ximu3.FileConverter) makes."""
+    mag = b"Timestamp (us),X (a.u.),Y (a.u.),Z (a.u.)\n" + b"".join(
+        b"%d,0.5,0,-1\n" % (20_000 * k) for k in range(4))
+    messages = b"".join([*(b"I,%d,1.5,-2.5,90,0,0.5,1\r\n" % (10_000 * k) for k in range(9)),
+                         *(b"M,%d,0.5,0,-1\r\n" % (20_000 * k) for k in range(4))])
+    source = Ximu3Csv()
+    found = read_parts(source, {"s/Inertial.csv": INERTIAL, "s/Magnetometer.csv": mag,
+                                "s/HighGAccelerometer.csv": HIGH_G})
+    expected = read(Ximu3(), messages)
+    assert set(found) == set(expected) and any("50 uT" in text for text in source.remarks)
+    for topic, log in expected.items():
+        assert list(found[topic].stamp) == list(log.stamp)
+        assert found[topic].flat() == pytest.approx(log.flat(), rel=1e-12)
+
+
 PHONE = {"Accelerometer": ("Acceleration", "m/s^2", 0.01, 0.0, (0.1, -2.5, 9.75)),
          "Gyroscope": ("Gyroscope", "rad/s", 0.012, 0.004, (0.25, 0.5, -1.5)),
          "Magnetometer": ("Magnetic field", "µT", 0.02, 0.0, (20.0, -3.5, -40.0))}
@@ -123,6 +146,26 @@ def test_all_dialects_of_phyphox_are_equal_and_its_clock_goes_on_in_a_pause():
     assert mag.stamp[0] == 1770000000_250_000_000
     assert mag.stamp[-1] == 1770000100_250_000_000 + 980_000_000
     assert np.linalg.norm(mag.mag, axis=1) == pytest.approx(np.full(50, 44.9e-6), abs=1e-6)
+
+
+def test_an_export_in_another_language_is_the_same():
+    words = {b"Time": b"Zeit", b"Acceleration": b"Beschleunigung", b"Gyroscope": b"Drehrate",
+             b"Magnetic field": b"Feld"}
+    files = {}
+    for name, data in zip(("Kraft", "Drehung", "Feld", "meta/time"), export().values()):
+        for english, german in words.items():
+            data = data.replace(english, german)
+        files[f"walk/{name}.csv"] = data
+    assert recognise(files).name == "phyphox"
+    assert same(read_parts(PhyphoxExport(), files), read_parts(PhyphoxExport(), export()))
+
+
+def test_an_accelerometer_alone_is_said(tmp_path):
+    part, data = next(iter(export().items()))
+    (tmp_path / "walk").mkdir()
+    (tmp_path / part).write_bytes(data)
+    with pytest.raises(ImuFusionError, match="there is the accelerometer alone"):
+        open_bag(tmp_path / "walk")
 
 
 def test_an_excel_export_is_read_by_its_library(tmp_path):
@@ -300,6 +343,8 @@ def zipped(files):
     ("log.zip", {"log.zip": zipped(sensor_logger())}, "Sensor Logger"),
     ("log", sensor_logger(), "Sensor Logger"), ("walk", export(), "phyphox"),
     ("a.bin", {"a.bin": solution(1) + solution(2) + solution(3)}, "u-blox"),
+    ("session", {"session/Inertial.csv": INERTIAL, "session/HighGAccelerometer.csv": HIGH_G},
+     "x-IMU3"),
     ("a.log", {"a.log": b"".join(b"I,%d,0,0,0,0,0,1\r\n" % k for k in range(9))}, "x-IMU3")])
 def test_formats_are_recognised_by_content(tmp_path, name, files, taken):
     for part, data in files.items():

@@ -15,6 +15,7 @@ from imu_fusion.recordings.convert import convert
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.sketch import sketch
+from imu_fusion.sources.source import EPOCH
 from imu_fusion.sources.table import TableSource
 from test.sources.logs import read
 
@@ -58,6 +59,8 @@ def test_units_counts_axes_and_frames():
     ("{column: t, unit: iso8601}", ["1970-01-01T00:00:01.000000001Z", "1970/01/01 00:00:02,5",
                                     "1970-01-01T01:00:03+01:00"],
      [1_000_000_001, 2_500_000_000, 3_000_000_000]),
+    ("{column: t, unit: iso8601, wrap: 86400}", ["23:59:58:250", "23:59:59.5", "0:00:00"],
+     [86398_250_000_000, 86399_500_000_000, 86400_000_000_000]),
     ("{column: t, unit: ms, week: w}", ["0", "500", "1000"],
      [(315_964_800 + 7 * 86400 * 2200 - 18) * 10**9 + ms * 10**6 for ms in (0, 500, 1000)]),
     ("{rate: 400.0}", ["", "", ""], [0, 2_500_000, 5_000_000])])
@@ -168,6 +171,53 @@ def test_headers_of_some_loggers():
     assert "motionUserAccelerationX(G)" in apple.unused
 
 
+MICROS = (2 ** 32 - 2_000_000 + np.round(1e6 * T).astype(int)) % 2 ** 32
+
+
+@pytest.mark.parametrize("data, begins", [
+    # German, decimal comma, the degree sign of Windows, a line ahead of the names.
+    ((b"Messung 4;;;\r\n" + written(
+        "Zeit [ms];Beschl X [g];Beschl Y [g];Beschl Z [g];Dreh X [\xb0/s];Dreh Y [\xb0/s];"
+        "Dreh Z [\xb0/s]", 1e3 * T, FORCE / G, np.degrees(RATE), delimiter=";", comma=True)
+      .decode().encode("cp1252")), EPOCH),
+    # A counter of 32 bits that begins anew, counts of a converter.
+    (written("micros,ax,ay,az,gx,gy,gz", MICROS, np.round(FORCE / G * 8192),
+             np.round(np.degrees(RATE) * 65.5)), EPOCH + 1000 * int(MICROS[0])),
+    # Units in a line of their own, which also has brackets; each row ends with a delimiter.
+    (b'"sep=\t"\n' + written("\t".join(
+        ["S_Timestamp_Unix_CAL", *(f"S_{name}_{axis}_CAL" for name in ("Accel_WR", "Gyro")
+                                   for axis in "XYZ")])
+        + "\nms\tm/(s^2)\tm/(s^2)\tm/(s^2)\tdeg/s\tdeg/s\tdeg/s", 1.8e12 + 1e3 * T, FORCE,
+        np.degrees(RATE), delimiter="\t").replace(b"\n", b"\t\n"), 1_800_000_000 * 10**9),
+    # GPS week and the seconds in it; the line of units is shorter than the names.
+    (written(" Week GPSTime AccX AccY AccZ GyroX GyroY GyroZ\n (sec) (m/s^2) (m/s^2) (m/s^2) "
+             "(deg/s) (deg/s) (deg/s)", np.full(len(T), 2400), 3600 + T, FORCE, np.degrees(RATE),
+             delimiter=" "), (315_964_800 + 2400 * 604_800 + 3600 - 18) * 10**9),
+    # Hours without a date; the force in g beside one without gravity.
+    ("\n".join(["time,ax,ay,az,gFx,gFy,gFz,wx,wy,wz,"] + [
+        f"10:00:{int(t):02d}:{round(1e3 * t) % 1000:03d},0.1,0,-0.1,"
+        + ",".join(f"{v:.6f}" for v in row) + "," for t, *row in zip(
+            T, *(FORCE / G).T, *RATE.T)]).encode() + b"\n", EPOCH + 36_000 * 10**9)],
+    ids=["german", "counter", "units below", "gps week", "hours"])
+def test_two_commands_suffice_for_strangers_logs(data, begins):
+    description = Description.from_mapping(yaml.safe_load(sketch(data, "t.csv").to_yaml()), "d")
+    source = TableSource(description)
+    imu = read(source, data, "t.csv")["imu/data_raw"]
+    assert imu.stamp == pytest.approx(begins + np.round(1e9 * T), abs=1e6)
+    assert imu.acc == pytest.approx(FORCE, abs=0.01)
+    assert imu.gyr == pytest.approx(RATE, abs=0.02)
+    assert not source.remarks
+
+
+def test_times_that_fall_back_are_said():
+    text = "t,x,y,z\n65530,0,0,1\n65535,0,0,1\n4,0,0,1\n9,0,0,1\n3,0,0,1\n"
+    source = TableSource(Description.from_mapping(yaml.safe_load(
+        "{time: {column: t, unit: ms}, accelerometer: {columns: [x, y, z], unit: g}}"), "d.yaml"))
+    read(source, text.encode(), "t.csv")
+    (said,) = source.remarks
+    assert "2 times fall back, the first in line 4 by 65.531 s" in said and "time.wrap" in said
+
+
 def test_force_without_gravity_is_doubted():
     found = sketch(written("t (s),Acc X (m/s^2),Acc Y (m/s^2),Acc Z (m/s^2)", T,
                            FORCE - [0, 0, G]), "t.csv")
@@ -241,3 +291,8 @@ def test_a_px4_log_is_forward_left_up_and_its_estimate_agrees(tmp_path):
     norm = np.linalg.norm(mag.mag, axis=1)
     assert 20e-6 < np.median(norm) < 70e-6
     assert logs["/fix"].cov_enu[:, 0, 0].min() > 0
+
+
+def test_as_many_rows_of_one_width_as_of_another():
+    """Found by benchmarks/fuzz.py."""
+    assert sketch(b"1,2\n" * 3 + b"1,2,3,4\n" * 3, "t.csv").unused == ["1", "2"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
+from imu_fusion.messages.layouts import IMU
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from imu_fusion.streams.acceleration_field import AccelerationFieldStream, FieldConfiguration
 from imu_fusion.streams.orientation import (
@@ -139,3 +140,25 @@ def test_what_comes_out_is_of_what_came_in(name, topic, recording):
     first, second = (run(STREAMS[name](), rows, lambda: 7)[0][topic] for rows in (recording, half))
     assert 100 < len(second) < len(first)
     assert second[:100] == first[:100]
+
+
+def later(cdrs, shift):
+    """Messages whose stamps are ``shift`` ns later; those without one as they are."""
+    moved = []
+    for cdr in cdrs:
+        second, nanosecond = np.frombuffer(cdr, "<i4", 2, 4).tolist()
+        stamp = np.array(divmod(second * 10**9 + nanosecond + shift, 10**9), "<i4")
+        moved.append(cdr[:4] + stamp.tobytes() + cdr[12:])
+    return moved
+
+
+@pytest.mark.parametrize("name, topic", [
+    ("orientation", "imu/data"), ("orientation, lag", "imu/data_smoothed"),
+    ("acceleration field", "acceleration_field/imu")])
+def test_a_microsecond_later_everywhere_estimates_differ_by_rounding(name, topic, recording):
+    moved = {t: later(cdrs, 1000) for t, cdrs in recording.items()}
+    first, second = (run(STREAMS[name](), rows, lambda: 50)[0][topic]
+                     for rows in (recording, moved))
+    assert [s + 1000 for s, _ in first] == [s for s, _ in second] and len(first) > 100
+    values = [IMU.decode_block([cdr for _, cdr in rows]).values for rows in (first, second)]
+    np.testing.assert_allclose(*values, rtol=1e-9, atol=1e-12)

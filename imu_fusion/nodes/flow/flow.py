@@ -9,7 +9,7 @@ from rclpy.qos import QoSProfile
 
 from imu_fusion.nodes.flow.peers import Peers
 from imu_fusion.nodes.flow.qos import steady_timer
-from imu_fusion.nodes.flow.sink import Input, Session, Sink, Turn
+from imu_fusion.nodes.flow.sink import NAP_LIVE, Input, Session, Sink, Turn
 from imu_fusion.nodes.flow.source import Output, Source
 from imu_fusion.nodes.flow.state import END, State
 
@@ -37,16 +37,18 @@ class Flow:
         hold: while it returns true, no session is joined.
         on_begin: called with each :class:`Session` before it is joined (``topics`` are those that
             it has); may add inputs.
+        nap: s, live, between the coming of a message and its being taken.
     """
 
     def __init__(self, node: Node, *, listens: bool = True, relays: bool = False,
                  wait_for: Collection[str] = (), hold: Callable[[], bool] = lambda: False,
-                 on_begin: Callable[[Session], None] = lambda session: None) -> None:
+                 on_begin: Callable[[Session], None] = lambda session: None,
+                 nap: float = NAP_LIVE) -> None:
         self._listens, self._relays = listens, relays
         self.peers = Peers(node, self._state, self._changed)
         self.problems = self.peers.problems
         self.source = Source(self.peers, wait_for)
-        self.sink = Sink(self.peers, hold, on_begin)
+        self.sink = Sink(self.peers, hold, on_begin, nap)
         if relays:
             self.source.upstream, self.sink.feeds = self.sink.company, self.source
         self._serve_at = 0.0
@@ -57,9 +59,11 @@ class Flow:
         """A publisher."""
         return self.source.output(msg_type, topic, qos)
 
-    def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None) -> Input:
-        """A subscription; ``qos`` is that outside sessions."""
-        return self.sink.input(msg_type, topic, qos)
+    def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None,
+              wakes: bool = True) -> Input:
+        """A subscription; outside sessions with ``qos``, and there messages that do not wake the
+        node are taken with the next that does, or 50 ms later."""
+        return self.sink.input(msg_type, topic, qos, wakes)
 
     def send(self) -> bool:
         """Send what waits; whether more may be made now."""

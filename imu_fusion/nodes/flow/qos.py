@@ -23,7 +23,7 @@ DEPTH = 1000  # queue depth of writers, and of readers outside sessions
 
 def reliable_qos(depth: int = DEPTH,
                  durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
-    """The QoS of writers: reliable, with room for twice the window."""
+    """The QoS of writers: reliable, with room for more than the window."""
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth,
                       reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 

@@ -17,10 +17,12 @@ from imu_fusion.nodes.flow.source import Source
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT, Joined, Sending, Taken
 
 AT_ONCE = 2000  # messages of one topic that are taken in one turn
-NAP, NAP_LIVE = 0.002, 0.0003  # s, in which a block grows: what was sent together comes together
+# s, in which a block grows: in a session; live, for what was sent together; where nobody waits.
+NAP, NAP_LIVE, NAP_PATIENT = 0.002, 0.0003, 0.02
+SHARED = ("/tf", "/tf_static")  # topics on which others' messages are no fault
 SILENCE = 5.0  # s, after which what is missing at the end counts as lost
 REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
-REPORT_EVERY = 1.0  # s
+REPORT_EVERY = 0.5  # s
 
 Message = tuple[bytes, dict]
 """CDR bytes; source_timestamp, received_timestamp (ns) and numbers, as rclpy has them."""
@@ -84,8 +86,9 @@ class _Gate(ReentrantCallbackGroup):
 class Input:
     """One subscription: live, or of a session. The counts are of all its sessions together."""
 
-    def __init__(self, sink: "Sink", msg_type: type, topic: str, qos: QoSProfile) -> None:
-        self.msg_type, self.topic, self.qos = msg_type, topic, qos
+    def __init__(self, sink: "Sink", msg_type: type, topic: str, qos: QoSProfile,
+                 wakes: bool) -> None:
+        self.msg_type, self.topic, self.qos, self.wakes = msg_type, topic, qos, wakes
         self.subscription: Subscription
         self.reader = ""  # its gid
         self.in_session = False  # whether it reads as in one
@@ -149,14 +152,15 @@ class Sink:
     Args:
         hold: while it returns true, no session is joined.
         on_begin: called with the :class:`Session` that is about to be joined; may add inputs.
+        nap: s, live, between the coming of a message and its being taken.
 
     ``feeds``: the source, where there is one, that sends what is made of this; while it cannot,
     nothing is taken.
     """
 
     def __init__(self, peers: Peers, hold: Callable[[], bool],
-                 on_begin: Callable[[Session], None]) -> None:
-        self.peers, self.node = peers, peers.node
+                 on_begin: Callable[[Session], None], nap: float = NAP_LIVE) -> None:
+        self.peers, self.node, self._nap = peers, peers.node, nap
         self.feeds: Source | None = None
         self.inputs: dict[str, Input] = {}
         self.sessions: dict[str, Session] = {}  # by instance of the sender
@@ -164,14 +168,16 @@ class Sink:
         self.woken = False
         self._hold, self._on_begin = hold, on_begin
         self._begun = False
+        self._left: dict[str, int] = {}  # broken session -> its version then
         self._reported: dict[str, int] = {}  # topic -> count
         self._unreported = 0.0  # bytes
         self._report_at = 0.0
 
-    def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None) -> Input:
-        """A new :class:`Input`; ``qos`` is that outside sessions."""
+    def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None,
+              wakes: bool = True) -> Input:
+        """A new :class:`Input`; see :meth:`Flow.input`."""
         topic = self.node.resolve_topic_name(topic)
-        found = self.inputs[topic] = Input(self, msg_type, topic, qos or reliable_qos())
+        found = self.inputs[topic] = Input(self, msg_type, topic, qos or reliable_qos(), wakes)
         return found
 
     def feeding(self) -> list[Session]:
@@ -179,8 +185,9 @@ class Sink:
         return [s for s in self.sessions.values() if s.topics and not s.finished]
 
     def company(self) -> set[str]:
-        """The instances that the senders of these sessions know."""
-        return {i for s in self.feeding() for i in s.said.company} - {self.peers.own}
+        """The instances that the senders of these sessions know, as long as they are there."""
+        return {i for s in self.feeding() if not s.broken
+                for i in s.said.company} - {self.peers.own}
 
     def joined(self) -> Mapping[str, Joined]:
         """What is said of the sessions.
@@ -230,7 +237,7 @@ class Sink:
 
     def wait(self, seconds: float) -> bool:
         """Wait for messages alone, at most so long; whether there are any."""
-        handles = [i.subscription.handle for i in self.inputs.values()]
+        handles = [i.subscription.handle for i in self.inputs.values() if i.wakes or i.sessions]
         if not handles or not self.gate.can_execute(None):
             return False
         with ExitStack() as held:
@@ -247,7 +254,7 @@ class Sink:
     def take(self) -> Turn:
         """One turn: all that waits on all topics."""
         if self.woken:
-            time.sleep(NAP if self.feeding() else NAP_LIVE)
+            time.sleep(NAP if self.feeding() else self._nap)
         self.woken = False
         turn = Turn()
         if self._begun:
@@ -288,12 +295,13 @@ class Sink:
     def _follow(self, peer):
         said = peer.state.sending
         session = self.sessions.get(peer.instance)
-        if session is not None and session.id == said.session:
+        if session is not None and session.id == said.session and not session.broken:
             session.said = said
         elif session is not None and not session.finished:
             if not session.has_ended:
                 self._break(session, "went on without this node")
-        elif said.event == BEGIN and self.peers.own in said.company and not self._hold():
+        elif (said.event == BEGIN and self.peers.own in said.company and not self._hold()
+              and said.version > self._left.get(said.session, 0)):
             self._join(peer, said)
 
     def _join(self, peer: Peer, said: Sending) -> None:
@@ -326,6 +334,8 @@ class Sink:
         self.peers.say()
 
     def _name_others(self, topic, peer):
+        if topic in SHARED:
+            return
         names = sorted({i.node_name for i in self.node.get_publishers_info_by_topic(topic)
                         if bytes(i.endpoint_gid).hex() != peer.state.sending.topics[topic].writer})
         if names:
@@ -335,6 +345,7 @@ class Sink:
 
     def _break(self, session, why):
         session.broken = True
+        self._left[session.id] = session.said.version
         if session.topics:
             self.peers.problem(f"the session of {session.source} broke off: it {why}")
 
@@ -362,8 +373,9 @@ class Sink:
             self.peers.problem(f"{topic_input.topic}: {-surplus} of {expected} messages LOST")
         elif surplus > 0 and not broken:
             topic_input.unexpected += surplus
-            self.peers.problem(f"{topic_input.topic}: {surplus} messages more than the {expected} "
-                          "of the session: somebody else publishes it, too")
+            if topic_input.topic not in SHARED:
+                self.peers.problem(f"{topic_input.topic}: {surplus} messages more than the "
+                                   f"{expected} of the session: somebody else publishes it, too")
         return max(0, -surplus)
 
     def _close_idle(self):

@@ -4,6 +4,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import Any
 
 from rclpy.publisher import Publisher
@@ -21,7 +22,7 @@ from imu_fusion.nodes.flow.qos import (
 )
 from imu_fusion.nodes.flow.state import BEGIN, END, MARK, Joined, Sending, Sent
 
-WINDOW = 500  # messages sent before all must be acknowledged; half the depth of the queue
+WINDOW = 250  # messages of a topic sent before all must be acknowledged: see fastdds.xml
 WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
@@ -126,6 +127,7 @@ class Source:
         # When anybody new was seen last.
         self._news_at = float("-inf") if wait_for else time.monotonic()
         self._session = ""
+        self._awaited: set[str] = set()  # of those names, not yet here in this session
         self._version = 0  # of the company
         self._takers: dict[str, tuple[str, Joined]] = {}  # instance -> name, what it said last
         self._event = ""  # with which the session is to end
@@ -153,6 +155,7 @@ class Source:
             self._begin_after = True
             return
         self._begin_after, self._event, self._session = False, "", uuid.uuid4().hex[:12]
+        self._awaited = set(self._wait_for)
         self.company, self._takers, self.lost = set(), {}, 0
         for output in self.outputs.values():
             output.start = output.sent
@@ -200,7 +203,7 @@ class Source:
         if self.phase == _JOINING:
             names = {peer.name for peer in self.peers.values() if peer.is_silent}
             names |= {instance.partition(MARK)[0] for instance in self._waiting()}
-            names |= self._wait_for - self._names()
+            names |= self._awaited
             return ("no answer yet from " + ", ".join(sorted(names)) if names
                     else "discovery is not complete")
         if self.phase == _LIVE:
@@ -241,12 +244,16 @@ class Source:
         if self.phase == _LIVE:
             return
         for instance, joined in self._answers().items():
-            if joined is not None:
-                _, before = self._takers.get(instance, ("", None))
-                self._takers[instance] = self.peers[instance].name, joined
-                if (before is not None and joined.finished and not before.finished
-                        and self.phase in (_JOINING, _OPEN)):
-                    self._miss(instance, "has left")
+            name, before = self._takers.get(instance, ("", None))
+            if joined is None and before is not None and instance in self.peers:
+                joined = replace(before, finished=True)  # it has lost sight of us for a while
+            if joined is None:
+                continue
+            self._takers[instance] = name or self.peers[instance].name, joined
+            if (before is not None and joined.finished and not before.finished
+                    and self.phase in (_JOINING, _OPEN)):
+                self._miss(instance, "has left")
+                self.company.discard(instance)  # asked anew, if it is still there
         if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
             self.peers.say()
@@ -298,7 +305,8 @@ class Source:
 
     def _all_joined(self):
         """All have answered, and the readers that they speak of are matched."""
-        if (self._waiting() or self._wait_for - self._names()
+        self._awaited -= self._names()  # who has joined may leave
+        if (self._waiting() or self._awaited
                 or any(peer.is_silent for peer in self.peers.values()) or self._is_settling()):
             return False
         for topic, output in self.outputs.items():
