@@ -152,8 +152,8 @@ class FusionParams(Parameters):
             "first. Set it to 1 for a gyroscope that was calibrated.")
     lasting_acc_sd: float = param(
         1.0, unit="m/s^2", low=0, high=100,
-        doc="Acceleration that lasts in the sensor's axes, as in turns of vehicles and walkers: one "
-            "more hypothesis, after a start at rest, with the gyroscope as stated and near iron. "
+        doc="Acceleration that lasts in the sensor's axes, as in turns of vehicles and walkers: "
+            "one more hypothesis, after a start at rest, with the gyroscope as stated and near iron. "
             "Raise it for an aeroplane; 0: none.")
     local_field_time: float = param(
         0.3, unit="s", low=1e-3,

@@ -350,7 +350,8 @@ def test_a_sudden_turn_is_motion_and_none_of_it_is_lost():
 def test_bias_estimation_can_be_switched_off(ordinary):
     imu, mag, _, _ = ordinary
     # Of several hypotheses the weights would go on.
-    one = {"fusion.gyro_factor": 1.0, "fusion.local_field_sd": 0.01}
+    one = {"fusion.gyro_factor": 1.0, "fusion.local_field_sd": 0.01,
+           "fusion.lasting_acc_sd": 0.0}
     estimator = make(one)
     first = estimator.run(imu[:2000], mag[:2000])
     estimator.set_params(OrientationParams.from_mapping(one | {"fusion.estimate_bias": False}))

@@ -167,7 +167,7 @@ def running():
     """Kernel state and parameters after one Imu sample, and a function that takes more."""
     state, par = new_state(), kernel_parameters(OrientationParams.from_mapping(
         {"mag.max_latency": 10.0, "gap.max": 10.0, "fusion.local_field_sd": 0.01,
-         "fusion.gyro_factor": 1.0}))
+         "fusion.gyro_factor": 1.0, "fusion.lasting_acc_sd": 0.0}))
     state["quat_world_imu"][0, 3] = state["history"]["quat"][0, 3] = 1.0
     state["cov"] = 1e-4 * np.eye(es.N)
     kernel._start_limits(state, par)
