@@ -153,8 +153,8 @@ class FusionParams(Parameters):
     lasting_acc_sd: float = param(
         1.0, unit="m/s^2", low=0, high=100,
         doc="Acceleration that lasts in the sensor's axes, as in turns of vehicles and walkers: "
-            "one more hypothesis, after a start at rest, with the gyroscope as stated and near iron. "
-            "Raise it for an aeroplane; 0: none.")
+            "one more hypothesis, after a start at rest, with the gyroscope as stated and near "
+            "iron. Raise it for an aeroplane; 0: none.")
     local_field_time: float = param(
         0.3, unit="s", low=1e-3,
         doc="Time in which a moving sensor leaves that behind. Lengthen it for slow motion.")
