@@ -8,11 +8,21 @@ from typing import Any
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import ParamsFile, parameters_for
+from imu_fusion.samples import checks
 from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.turning import check_axes
+from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC
 
 
-def _no_findings(logs: Mapping) -> list[Finding]:
-    return []
+def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
+    """What looks wrong with whole logs as recorded, Imu, magnetometer and fixes by topic."""
+    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
+    if FIX_TOPIC in logs:
+        found += checks.check_fix(logs[FIX_TOPIC])
+    if MAG_TOPIC in logs:
+        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
+        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +38,7 @@ class Stage:
         outputs: topic to message type.
         stream: the class of its Stream, ``(*params, warn=...)``.
         findings: ``(logs)`` lists what looks wrong with whole logs as recorded.
-        configure: ``(stage, params_file)`` is (Stage, parameters), where reading the parameters is
-            not all: topics may depend on them.
+        configure: ``(stage, params_file)`` is (Stage, parameters): topics may depend on these.
         unusable: why it cannot run, empty if it can.
     """
 
@@ -40,8 +49,8 @@ class Stage:
     required: tuple[str, ...]
     outputs: Mapping[str, str]
     stream: type[Any]
-    findings: Callable[[Mapping], Sequence[Finding]] = _no_findings
-    configure: Callable[["Stage", ParamsFile], tuple["Stage", list]] | None = None
+    findings: Callable[[Mapping], Sequence[Finding]]
+    configure: Callable[["Stage", ParamsFile], tuple["Stage", list]]
     unusable: str = ""
 
     def prepare(self, params_file: ParamsFile = None) -> tuple["Stage", list]:
@@ -50,9 +59,7 @@ class Stage:
         Raises:
             ImuFusionError: the parameters, or files that they name, are not usable.
         """
-        if self.configure is not None:
-            return self.configure(self, params_file)
-        return self, self.read_params(params_file)
+        return self.configure(self, params_file)
 
     def has_clock(self, topic: str) -> bool:
         """Whether the clock of a topic is judged: see Guard."""

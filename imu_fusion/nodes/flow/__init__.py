@@ -42,9 +42,9 @@ answer ``wait_for_all_acked`` at once.
 """
 
 from imu_fusion.nodes.flow.flow import Flow
-from imu_fusion.nodes.flow.qos import DEPTH, reliable_qos, sensor_qos, steady_timer
+from imu_fusion.nodes.flow.qos import DEPTH, live_qos, reliable_qos, steady_timer
 from imu_fusion.nodes.flow.sink import NAP_LIVE, NAP_PATIENT, Turn
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT
 
 __all__ = ["BEGIN", "DEPTH", "END", "NAP_LIVE", "NAP_PATIENT", "NEXT", "Flow", "Turn",
-           "reliable_qos", "sensor_qos", "steady_timer"]
+           "live_qos", "reliable_qos", "steady_timer"]
