@@ -2,10 +2,12 @@
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
+from imu_fusion.errors import SampleError
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.sources.phyphox import PhyphoxLive
@@ -102,7 +104,8 @@ def read_answer(path: Path) -> None:
         for _ in range(sound):
             poll(source, server)
         for _ in range(3):
-            source.feed(path.read_bytes(), source.request() or "")
+            with suppress(SampleError):    # the driver says so, and asks again
+                source.feed(path.read_bytes(), source.request() or "")
         source.finish()
 
 

@@ -172,7 +172,7 @@ def process(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
                 report.node: report.results for report in reports if report.results}
             write_results(writer.directory, results | _found(reports) | left_out(
                 {report.node: report.refused for report in reports},
-                reader.warnings if reader.damaged else ()))
+                reader.losses))
     warnings += [finding.text for report in reports for finding in report.findings]
     warnings += [f"{report.node}: {text}" for report in reports
                  for text in (*report.warnings, *report.remarks)]

@@ -8,6 +8,12 @@ INCOMPLETE = 3
 """Exit code: finished, but something was lost."""
 
 
+def shown(text: str, most: int = 2000) -> str:
+    """Text as a terminal may have it: names in a file may hold what speaks to it, and be long."""
+    text = text if len(text) <= most else f"{text[:most]}..."
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 class ImuFusionError(Exception):
     """Root of all errors that this package raises on purpose."""
 

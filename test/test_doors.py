@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from imu_fusion import batch, cli
 from imu_fusion.messages.layouts import IMU
+from imu_fusion.nodes.base import message_class
 from imu_fusion.nodes.pipeline import plan_pipeline
 from imu_fusion.nodes.replayer import ReplayerParams
 from imu_fusion.recordings.bag_reader import open_bag
@@ -18,6 +19,7 @@ from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.contents import smoothed_of
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.trajectory_data import read_result
+from imu_fusion.streams.registry import STAGES
 from test.nodes.test_smoother import write as write_drive
 from test.report.test_report import Page
 from test.test_cli import write
@@ -155,6 +157,8 @@ def test_several_recordings_in_one_call_and_a_table_of_what_was_found(tmp_path):
     found = json.loads((tmp_path / "monday" / "second" / "results.json").read_text())["smoother"]
     assert float(rows["second"]["smoother.cost"]) == found["cost"]
     assert float(rows["first"]["smoother.origin.latitude_deg"]) == found["origin"]["latitude_deg"]
+    assert found["units"]["height"] == "m" and set(found["states"]) <= set(found["units"])
+    assert not any("units" in name for name in rows["first"])
     said = call("process", first, first, tmp_path / "tuesday", code=1)
     assert "called first, as" in said and not (tmp_path / "tuesday").exists()
 
@@ -166,6 +170,32 @@ def test_export_writes_the_forms_that_are_asked_for(tmp_path):
     call("export", bag, tmp_path / "both", "--csv", "--gpx", "--topic", "fix")
     assert sorted(f.name for f in (tmp_path / "both").iterdir()) == ["fix.csv", "fix.gpx"]
     assert "of the form tum" in call("export", bag, tmp_path / "none", "--tum", code=1)
+
+
+# What the panel draws, as its source says (ThreeDeeRender/ros.ts of Foxglove Studio).
+IN_SPACE = {"nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/PointCloud2",
+            "geometry_msgs/msg/PoseWithCovarianceStamped"}
+
+
+def test_the_layout_for_foxglove_plots_fields_that_its_messages_have():
+    panels = json.loads((ROOT / "config" / "foxglove.json").read_text())["configById"]
+    types = {f"/{topic}": msgtype for stage in STAGES.values()
+             for topic, msgtype in stage.outputs.items()}
+    types["/reference/pose"] = "geometry_msgs/msg/PoseStamped"
+    assert {name.partition("!")[0] for name in panels} == {"3D", "map", "Plot"}
+    for name, panel in panels.items():
+        for topic in panel.get("topics", {}):
+            assert types[topic] in IN_SPACE, f"{name} cannot draw {topic}"
+        for path in panel.get("paths", ()):
+            assert path["enabled"] and path["timestampMethod"] == "headerStamp", path
+            topic, *fields = path["value"].split(".")
+            value = message_class(types[topic])()
+            assert value.header.stamp is not None
+            for field in fields:
+                value = getattr(value, field)
+            assert isinstance(value, float), path
+    # The map takes every NavSatFix that is there.
+    assert "sensor_msgs/msg/NavSatFix" in types.values()
 
 
 def test_the_layout_for_foxglove_shows_topics_that_there_are():

@@ -8,15 +8,18 @@ from typing import Any
 import yaml
 
 from imu_fusion.errors import TopicError
-from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_reader import Lose, open_bag
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.samples.guard import usable_part
 from imu_fusion.samples.logs import FixLog
 
 _FIX = "fix"
 
 
-def read_topic(bag: str | Path, topic: str) -> tuple[Any, FixLog | None]:
-    """The log of a topic, and the first usable fix of the recording (FixLog of one) or None.
+def read_topic(bag: str | Path, topic: str, lose: Lose = lambda text: None
+               ) -> tuple[Any, FixLog | None, list[str]]:
+    """The log of the usable samples of a topic, the first usable fix of the recording (FixLog of
+    one) or None, and texts on what was left out.
 
     Raises:
         TopicError: no such topic.
@@ -27,7 +30,10 @@ def read_topic(bag: str | Path, topic: str) -> tuple[Any, FixLog | None]:
             raise TopicError(f"{bag}: no topic {topic}; there are: {', '.join(sorted(names))}")
         log = read_log(reader, topic)
         fix = read_log(reader, _FIX) if _FIX in names else None
-    return log, fix[fix.usable][0] if fix is not None and fix.usable.any() else None
+        for text in reader.losses:
+            lose(text)
+    log, remarks = usable_part(log, topic)
+    return log, fix[fix.usable][0] if fix is not None and fix.usable.any() else None, remarks
 
 
 def parameter_text(sensor: str, values: Mapping[str, Any], bag: str | Path, said: Sequence[str],

@@ -7,6 +7,7 @@ import numpy as np
 from imu_fusion.calibrate.files import parameter_text, read_topic
 from imu_fusion.errors import CalibrationError
 from imu_fusion.geometry.gravity import normal_gravity
+from imu_fusion.recordings.bag_reader import Lose
 from imu_fusion.samples.checks import flat_tops
 from imu_fusion.samples.logs import ImuLog, seconds
 from imu_fusion.samples.rest import Rest, find_rests
@@ -23,9 +24,13 @@ _SHORT = {"accelerometer": "acc", "gyroscope": "gyro"}
 _UNITS = {"accelerometer": "m/s\u00b2", "gyroscope": "rad/s"}
 
 
-def calibrate_recorded_accelerometer(bag: str | Path, topic: str = _IMU
+def calibrate_recorded_accelerometer(bag: str | Path, topic: str = _IMU,
+                                     lose: Lose = lambda text: None
                                      ) -> tuple[LinearCalibration, list[str]]:
     """From the rests of a recording: the six sides up, or a dozen other poses.
+
+    Args:
+        lose: called with texts on what of it cannot be read.
 
     Returns:
         LinearCalibration, and texts on what makes it doubtful.
@@ -34,8 +39,7 @@ def calibrate_recorded_accelerometer(bag: str | Path, topic: str = _IMU
         TopicError: no such topic. CalibrationError: rests that do not determine it, or contradict
             each other.
     """
-    imu, fix = read_topic(bag, topic)
-    remarks = []
+    imu, fix, remarks = read_topic(bag, topic, lose)
     if fix is None:
         gravity = _STANDARD_GRAVITY
         remarks.append(f"no fix tells the gravity of the place: {gravity} m/s^2 is taken, and "
@@ -51,18 +55,20 @@ def calibrate_recorded_accelerometer(bag: str | Path, topic: str = _IMU
 
 
 def calibrate_recorded_gyroscope(bag: str | Path, topic: str = _IMU,
-                                 angle_deg: float | None = None
+                                 angle_deg: float | None = None,
+                                 lose: Lose = lambda text: None
                                  ) -> tuple[LinearCalibration, list[str]]:
     """From the turns between the rests of a recording.
 
     Args:
         angle_deg: by which every turn went, about one axis; None: not known.
+        lose: called with texts on what of it cannot be read.
 
     Returns, Raises:
         As :func:`calibrate_recorded_accelerometer`.
     """
-    imu, _ = read_topic(bag, topic)
-    rests, remarks = _rests(imu, bag), []
+    imu, _, remarks = read_topic(bag, topic, lose)
+    rests = _rests(imu, bag)
     if flat_tops(imu.gyr):
         raise CalibrationError(f"{bag}: the rates reach the end of the gyroscope's range: turn "
                                "it more slowly")

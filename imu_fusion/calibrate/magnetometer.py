@@ -8,6 +8,7 @@ import numpy as np
 from imu_fusion.calibrate.files import parameter_text, read_topic
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
+from imu_fusion.recordings.bag_reader import Lose
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, calibrate_magnetometer
 
 _MAG = "imu/mag"
@@ -15,7 +16,8 @@ _SCATTER = 0.05      # of the field, beyond which one ellipsoid does not describ
 _COVERAGE = 0.3      # of the directions, below which the fit is one of a ring
 
 
-def calibrate_recorded_magnetometer(bag: str | Path, topic: str = _MAG
+def calibrate_recorded_magnetometer(bag: str | Path, topic: str = _MAG,
+                                    lose: Lose = lambda text: None
                                     ) -> tuple[MagCalibration, list[str]]:
     """In situ calibration (Winkler 2025, appendix A) of the magnetometer in a recording.
 
@@ -24,6 +26,7 @@ def calibrate_recorded_magnetometer(bag: str | Path, topic: str = _MAG
 
     Args:
         bag: path of a recording in which the sensor turned. topic: its sensor_msgs/MagneticField.
+        lose: called with texts on what of it cannot be read.
 
     Returns:
         MagCalibration, and texts on what makes it doubtful.
@@ -31,8 +34,8 @@ def calibrate_recorded_magnetometer(bag: str | Path, topic: str = _MAG
     Raises:
         TopicError: no such topic. CalibrationError: directions that do not determine it.
     """
-    norm, remarks = None, []
-    mag, first = read_topic(bag, topic)
+    norm = None
+    mag, first, remarks = read_topic(bag, topic, lose)
     if first is not None:
         try:
             norm = float(np.linalg.norm(magnetic_field_world(

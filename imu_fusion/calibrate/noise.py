@@ -13,7 +13,7 @@ import numpy as np
 
 from imu_fusion.calibrate.files import parameter_text, read_topic
 from imu_fusion.errors import CalibrationError
-from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.bag_reader import Lose, open_bag
 
 _IMU, _MAG = "imu/data_raw", "imu/mag"
 _FLICKER = 0.664       # of the bias instability, is the lowest deviation
@@ -85,9 +85,12 @@ def _read_off(tau, deviation):
     return density, float(deviation[lowest]) / _FLICKER, walk
 
 
-def recorded_noise(bag: str | Path, topic: str = _IMU, mag_topic: str = _MAG
-                   ) -> tuple[list[NoiseOfSensor], list[str]]:
+def recorded_noise(bag: str | Path, topic: str = _IMU, mag_topic: str = _MAG,
+                   lose: Lose = lambda text: None) -> tuple[list[NoiseOfSensor], list[str]]:
     """Noise of gyroscope, accelerometer and, where there is one, magnetometer in a recording.
+
+    Args:
+        lose: called with texts on what of it cannot be read.
 
     Returns:
         list of NoiseOfSensor, and texts on what makes it doubtful.
@@ -95,15 +98,16 @@ def recorded_noise(bag: str | Path, topic: str = _IMU, mag_topic: str = _MAG
     Raises:
         TopicError: no such topic. CalibrationError: too short.
     """
-    imu, _ = read_topic(bag, topic)
+    imu, _, remarks = read_topic(bag, topic, lose)
     parts = [("gyroscope", "rad/s", imu.stamp, imu.gyr), ("accelerometer", "m/s^2", imu.stamp,
                                                           imu.acc)]
     with open_bag(bag) as reader:
         has_mag = mag_topic in {name.lstrip("/") for name in reader.topics}
     if has_mag:
-        mag, _ = read_topic(bag, mag_topic)
+        mag, _, left_out = read_topic(bag, mag_topic, lose)
+        remarks += left_out
         parts.append(("magnetometer", "T", mag.stamp, mag.mag))
-    found, remarks = [], []
+    found = []
     for name, unit, stamp, values in parts:
         values = values[np.isfinite(values).all(axis=1)]
         steps = np.diff(stamp) * 1e-9

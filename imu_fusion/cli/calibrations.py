@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from imu_fusion.cli.common import console, warn
+from imu_fusion.cli.common import console, end, warn
 from imu_fusion.errors import ParameterError
 
 
@@ -19,13 +19,23 @@ imu_topic_option = click.option("--topic", default="imu/data_raw", show_default=
                                 help="Its topic in BAG.")
 
 
-def _show_calibration(title, rows, remarks, text, out):
-    """Print what a calibration says of itself; its parameter file goes to ``out`` or is shown."""
+def _begin(bag: str, *outs: str | None) -> list[str]:
+    """Refuse to write over the recording; returns what takes texts on what it lacks."""
+    from imu_fusion.recordings.targets import refuse_files
+    for out in outs:
+        if out is not None:
+            refuse_files([bag], out)
+    return []
+
+
+def _show_calibration(title, rows, remarks, text, out, lost):
+    """Print what a calibration says of itself; its parameter file goes to ``out`` or is shown.
+    lost: texts on what of the recording cannot be read."""
     table = Table(title, "")
     for name, value in rows:
         table.add_row(name, value)
     console.print(table)
-    warn(remarks)
+    warn(dict.fromkeys([*lost, *remarks]))
     if out is None:
         click.echo(text)
     else:
@@ -34,6 +44,7 @@ def _show_calibration(title, rows, remarks, text, out):
         except OSError as error:
             raise ParameterError(f"{out}: cannot be written ({error.strerror})") from None
         click.echo(f"written: {out}")
+    end(bool(lost))
 
 
 @calibrate.command("accelerometer")
@@ -47,9 +58,10 @@ def calibrate_accelerometer(bag: str, topic: str, out: str | None) -> None:
     rests are found by themselves. Gives calibration.acc_matrix and acc_bias.
     """
     from imu_fusion.calibrate import inertial
-    found, remarks = inertial.calibrate_recorded_accelerometer(bag, topic)
+    lost = _begin(bag, out)
+    found, remarks = inertial.calibrate_recorded_accelerometer(bag, topic, lost.append)
     _show_calibration("accelerometer", inertial.linear_report("accelerometer", found), remarks,
-                      inertial.linear_parameters("accelerometer", found, bag), out)
+                      inertial.linear_parameters("accelerometer", found, bag), out, lost)
 
 
 @calibrate.command("gyroscope")
@@ -66,9 +78,10 @@ def calibrate_gyroscope(bag: str, topic: str, angle: float | None, out: str | No
     gyro_bias.
     """
     from imu_fusion.calibrate import inertial
-    found, remarks = inertial.calibrate_recorded_gyroscope(bag, topic, angle)
+    lost = _begin(bag, out)
+    found, remarks = inertial.calibrate_recorded_gyroscope(bag, topic, angle, lost.append)
     _show_calibration("gyroscope", inertial.linear_report("gyroscope", found), remarks,
-                      inertial.linear_parameters("gyroscope", found, bag), out)
+                      inertial.linear_parameters("gyroscope", found, bag), out, lost)
 
 
 @calibrate.command("noise")
@@ -85,12 +98,13 @@ def calibrate_noise(bag: str, topic: str, mag_topic: str, plot: str | None, out:
     nobody walks.
     """
     from imu_fusion.calibrate import noise
-    found, remarks = noise.recorded_noise(bag, topic, mag_topic)
+    lost = _begin(bag, out, plot)
+    found, remarks = noise.recorded_noise(bag, topic, mag_topic, lost.append)
     if plot is not None:
         noise.write_plot(found, plot)
         click.echo(f"written: {plot}")
     _show_calibration("noise, x, y, z", [row for s in found for row in noise.noise_report(s)],
-                      remarks, noise.noise_parameters(found, bag), out)
+                      remarks, noise.noise_parameters(found, bag), out, lost)
 
 
 @calibrate.command("magnetometer")
@@ -104,6 +118,7 @@ def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
     orientation estimator and the smoother take them.
     """
     from imu_fusion.calibrate import magnetometer
-    found, remarks = magnetometer.calibrate_recorded_magnetometer(bag, topic)
+    lost = _begin(bag, out)
+    found, remarks = magnetometer.calibrate_recorded_magnetometer(bag, topic, lost.append)
     _show_calibration("magnetometer", magnetometer.magnetometer_report(found), remarks,
-                      magnetometer.magnetometer_parameters(found, bag), out)
+                      magnetometer.magnetometer_parameters(found, bag), out, lost)

@@ -7,7 +7,7 @@ from typing import Any
 import click
 from rich.console import Console
 
-from imu_fusion.errors import INCOMPLETE, ImuFusionError
+from imu_fusion.errors import INCOMPLETE, ImuFusionError, shown
 
 PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True}
 console = Console(highlight=False)
@@ -20,7 +20,7 @@ class Group(click.Group):
         try:
             return super().invoke(ctx)
         except ImuFusionError as error:
-            click.echo(f"imu_fusion: {error}", err=True)
+            click.echo(f"imu_fusion: {shown(str(error))}", err=True)
             ctx.exit(1)
         except ModuleNotFoundError as error:
             extras = {"rclpy": "ros", "plotly": "report", "matplotlib": "report",

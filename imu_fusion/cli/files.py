@@ -13,7 +13,7 @@ from imu_fusion.cli.common import (
     say,
     warn,
 )
-from imu_fusion.errors import ParameterError
+from imu_fusion.errors import ParameterError, shown
 
 
 @click.command()
@@ -28,7 +28,7 @@ def info(bag: str, target: str | None) -> None:
     from imu_fusion.recordings.repair import repair
     with open_bag(bag) as reader:
         duration = (reader.end_time - reader.start_time) * 1e-9
-        click.echo(f"{bag}: {reader.count} messages, {duration:.1f} s"
+        click.echo(f"{shown(bag)}: {reader.count} messages, {duration:.1f} s"
                    + (f", {reader.format}" if reader.format else ""))
         losses = read_losses(reader)
         rows = inspect_topics(reader, STRETCH)
@@ -99,8 +99,11 @@ def export(bag: str, out: str, topics: tuple[str, ...], forms: tuple[str, ...]) 
     also as TUM trajectories, fixes as a GPX track; or only what is asked for.
     """
     from imu_fusion.recordings.export import export as export_tables
-    for name, rows in export_tables(bag, out, topics, forms).items():
+    lost: list[str] = []
+    for name, rows in export_tables(bag, out, topics, forms, lost.append).items():
         click.echo(f"written: {Path(out) / name} with {rows} rows")
+    warn(lost)
+    end(bool(lost))
 
 
 @click.command()
@@ -117,7 +120,11 @@ def avaframe(bag: str, out: str, crs: str | None, interval: float) -> None:
     trajectoryLengthXY, trajectoryLengthXYZ, time.
     """
     from imu_fusion.recordings.avaframe import export_avaframe
-    click.echo(f"written: {out} with {export_avaframe(bag, out, crs, interval)} rows")
+    lost: list[str] = []
+    rows = export_avaframe(bag, out, crs, interval, lost.append)
+    click.echo(f"written: {out} with {rows} rows")
+    warn(lost)
+    end(bool(lost))
 
 
 @click.command()

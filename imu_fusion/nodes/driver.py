@@ -15,7 +15,7 @@ from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.source_storage import in_range
 from imu_fusion.sources.clock import DeviceClock
-from imu_fusion.sources.registry import FORMATS, HEAD, live_source, recognise
+from imu_fusion.sources.registry import FORMATS, HEAD, check_transport, live_source, recognise
 from imu_fusion.sources.source import (
     ARRAY_TOPIC,
     FIX_TOPIC,
@@ -83,6 +83,7 @@ class Driver(Node):
             self._source: Source = self._file.source
         else:
             self._source = live_source(p.source, self._description, str(p.description))
+            check_transport(p.source, p.transport)
             wake = self.create_guard_condition(lambda: None)
             self._connection = Connection(
                 open_transport(p.transport, self._source.request), wake.trigger, p.silence,
@@ -154,15 +155,16 @@ class Driver(Node):
 
     def _watch(self, connection: Connection) -> None:
         """Say what has changed about the device."""
-        if connection.problem != self._problem:
-            self._problem = connection.problem
-            if self._problem and self._p.reconnect:
-                self.get_logger().warning(f"{self._problem}; waiting for it")
-            elif self._problem and connection.connections:
-                self.get_logger().warning(self._problem)
-        if connection.connections != self._connections:
-            self._connections = connection.connections
+        problem, connections = connection.problem, connection.connections
+        is_new = connections != self._connections
+        if connections and (is_new or self._problem) and (not problem or not self._connections):
             self.get_logger().info(f"{self._p.transport}: connected")
+        if problem and problem != self._problem:
+            if self._p.reconnect:
+                self.get_logger().warning(f"{problem}; waiting for it")
+            elif connections:
+                self.get_logger().warning(problem)
+        self._problem, self._connections = problem, connections
 
     def _feed(self, chunk: Chunk) -> None:
         if chunk.begins:

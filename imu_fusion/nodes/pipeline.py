@@ -150,4 +150,4 @@ def find_left_out(bag: str | Path, plan: Plan
                 found[topic] = guard.refused() | (
                     {UNDECODABLE: undecodable} if undecodable else {})
             refused[stage.node] = {topic: why for topic, why in found.items() if why}
-        return refused, list(reader.warnings if reader.damaged else ())
+        return refused, reader.losses

@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import BagError
-from imu_fusion.messages.layouts import FIX, ODOMETRY
-from imu_fusion.recordings.bag_reader import Reader, open_bag
+from imu_fusion.errors import BagError, TopicError
+from imu_fusion.messages.layouts import FIX, NANOSECONDS, ODOMETRY
+from imu_fusion.recordings.bag_reader import Lose, Reader, open_bag
+from imu_fusion.recordings.logs import decoded_blocks
 from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.samples.blocks import joined
 
 _ODOMETRY, _FIX = "smoother/odometry", "smoother/fix"
 #: Its names: places in m, velocities in m/s along the axes of the places, time in s.
@@ -34,13 +36,14 @@ def particle_table(time: np.ndarray, position: np.ndarray, velocity: np.ndarray)
 
 
 def export_avaframe(path: str | Path, out: str | Path, crs: str | None = None,
-                    interval: float = 0.1) -> int:
+                    interval: float = 0.1, lose: Lose = lambda text: None) -> int:
     """Write the smoothed trajectory of a recording as a CSV file.
 
     Args:
         path: recording with smoother/odometry. out: file to write. crs: reference system of X and
             Y, such as EPSG:31254; None: east and north of the origin. Z is the ellipsoidal height
-            with it, without it up from the origin. interval: s, between rows.
+            with it, without it up from the origin. interval: s, between rows. lose: called with
+            texts on what of the recording cannot be read.
 
     Returns:
         number of rows.
@@ -52,7 +55,18 @@ def export_avaframe(path: str | Path, out: str | Path, crs: str | None = None,
     refuse_source(path, out)
     with open_bag(path) as reader:
         stamp, values = _decoded(reader, _ODOMETRY, ODOMETRY)
-        place = _decoded(reader, _FIX, FIX)[1][:, FIX_PLACE] if crs is not None else None
+        usable = np.linalg.norm(values[:, ODOMETRY["orientation"]], axis=1) > 0.5    # not NaN
+        stamp, values = stamp[usable], values[usable]
+        place = None
+        if crs is not None:
+            fix_stamp, fixes = _decoded(reader, _FIX, FIX)
+            stamp, rows, of_fix = np.intersect1d(stamp, fix_stamp, return_indices=True)
+            values, place = values[rows], fixes[of_fix, FIX_PLACE]
+    if len(stamp) < 2 or stamp[-1] - stamp[0] < interval * NANOSECONDS:
+        raise TopicError(f"{path}: {len(stamp)} messages on {_ODOMETRY} are no trajectory of "
+                         f"{interval:g} s")
+    for text in reader.losses:
+        lose(text)
     velocity = Rotation.from_quat(values[:, ODOMETRY["orientation"]]).apply(
         values[:, ODOMETRY["linear"]])
     position = values[:, ODOMETRY["position"]]
@@ -74,8 +88,8 @@ FIX_PLACE = slice(2, 5)
 
 def _decoded(reader: Reader, topic, layout):
     name = reader.require(topic).name
-    block = layout.decode_block([cdr for *_, cdr in reader.messages([name])])
-    return block.stamp, block.values
+    blocks = [(block.stamp, block.values) for block in decoded_blocks(reader, name, layout)]
+    return joined([(np.empty(0, np.int64), np.empty((0, layout.size))), *blocks])
 
 
 def _projected(place, velocity, crs):

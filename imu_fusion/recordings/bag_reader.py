@@ -7,18 +7,25 @@ together, and where it contradicts them it is said and not believed.
 """
 
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path, PurePosixPath
-from typing import Any
+from pathlib import Path
 
 import zstandard
 
-from imu_fusion.errors import BagError, ImuFusionError, MessageError, ParameterError, TopicError
+from imu_fusion.errors import BagError, ImuFusionError, MessageError, TopicError, shown
 from imu_fusion.messages.nested import Nested, nested
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.bounded_yaml import read_yaml
+from imu_fusion.recordings.files import (
+    PACKED,
+    ZSTD,
+    is_recording,
+    kind_of,
+    storage_files,
+    unpacked_by,
+)
 from imu_fusion.recordings.mcap_storage import McapStorage
 from imu_fusion.recordings.ros1_storage import Ros1Storage
 from imu_fusion.recordings.source_storage import SourceStorage, format_of
@@ -32,14 +39,16 @@ from imu_fusion.recordings.storage import (
     largest_chunk,
     unpack,
 )
-from imu_fusion.recordings.targets import DATA_SUFFIXES, METADATA_FILE
+from imu_fusion.recordings.targets import METADATA_FILE
 
 _STORAGES: dict[str, type[Storage]] = {
     ".mcap": McapStorage, ".db3": SqliteStorage, ".bag": Ros1Storage}
-_PACKED = ".zstd"          # rosbag2's --compression-mode file
-_ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message of its --compression-mode message; CDR never does
 _LARGEST_RATIO = 1000      # of a file and what it unpacks to
 _PIECE = 1 << 20
+
+
+Lose = Callable[[str], object]
+"""Called with texts on what of a recording cannot be read."""
 
 
 @dataclass
@@ -75,10 +84,12 @@ def open_bag(path: str | Path, description: str | Path | None = None,
         try:
             if not path.exists():
                 raise BagError(f"{path}: no such file or directory")
-            if description is not None or not _is_recording(path):
+            if not (path.is_file() or path.is_dir()):
+                raise BagError(f"{path}: neither a file nor a directory")
+            if description is not None or not is_recording(path):
                 reader.open_source(description)
             else:
-                reader.open(_storage_files(path, reader.warnings))
+                reader.open(storage_files(path, reader.mention))
         except (OSError, ValueError) as error:    # ValueError: a name that no file can have
             if isinstance(error, ImuFusionError):
                 raise
@@ -91,55 +102,6 @@ def open_bag(path: str | Path, description: str | Path | None = None,
         reader.close()
         raise
     return reader
-
-
-def _storage_files(path: Path, warnings: list[str]) -> list[Path]:
-    """The files of a recording, in order; what is wrong with its metadata goes to ``warnings``."""
-    if path.is_file():
-        return [path]
-    for suffix in DATA_SUFFIXES:
-        files = sorted((p for p in path.iterdir() if p.name.endswith(suffix) and p.is_file()),
-                       key=_split_index)
-        if files:
-            return _named(path, files, warnings)
-    raise BagError(f"{path}: a directory without .mcap or .db3 files is not a recording")
-
-
-def _is_recording(path: Path) -> bool:
-    """Whether the names say so; what is none may be of a device."""
-    if path.is_file():
-        return path.name.endswith((*DATA_SUFFIXES, ".bag"))
-    return any(file.name.endswith(DATA_SUFFIXES) for file in path.iterdir())
-
-
-def _split_index(path: Path) -> tuple[int, str]:
-    """Order of the files of a split recording: by the number at their end, 2 before 10."""
-    number = path.name.partition(".")[0].rpartition("_")[2]
-    return (int(number) if number.isdecimal() and len(number) < 19 else 0, path.name)
-
-
-def _named(path: Path, files: list[Path], warnings: list[str]) -> list[Path]:
-    """Those of the data files that metadata.yaml names; all of them, where it names none."""
-    if not (path / METADATA_FILE).exists():
-        return files
-    try:
-        said = read_yaml(path / METADATA_FILE)["rosbag2_bagfile_information"]
-        names = [PurePosixPath(str(name)).name for name in said["relative_file_paths"]]
-    except (ParameterError, KeyError, TypeError) as error:
-        why = str(error) if isinstance(error, ParameterError) else "no metadata of rosbag2"
-        warnings.append(f"{METADATA_FILE} is not used: {why.removeprefix(f'{path}/')}")
-        return files
-    known = {file.name for file in files}
-    missing = sorted(set(names) - known)
-    if missing:
-        warnings.append(f"{METADATA_FILE} names {', '.join(missing[:5])}, which "
-                        f"{'is' if len(missing) == 1 else 'are'} not there; read is what is there")
-        return files
-    left_out = sorted(known - set(names))
-    if left_out:
-        warnings.append(f"{', '.join(left_out[:5])} is not named in {METADATA_FILE} and is left "
-                        "out; it can be read by its own name")
-    return [file for file in files if file.name in names] or files
 
 
 class Reader:
@@ -159,7 +121,7 @@ class Reader:
         self._nested: dict[str, tuple[str, Nested]] = {}    # topic.field: (topic, what is there)
         self._storages: list[Storage] = []
         self._stored: dict[str, StoredTopic] = {}
-        self._temporary: list[Any] = []
+        self._temporary: list[tempfile.TemporaryDirectory] = []
 
     def __enter__(self) -> "Reader":
         return self
@@ -176,10 +138,15 @@ class Reader:
             if file.stat().st_size == 0:
                 self.lose(f"{file.name} is empty (0 bytes)")
                 continue
-            plain = self._plain(file) if file.suffix == _PACKED else file
-            storage = _STORAGES[plain.suffix](plain, self.lose, self.mention)
-            self._storages.append(storage)
-            self._add(storage)
+            try:
+                self._open_file(file)
+            except BagError as error:
+                if len(files) == 1:
+                    raise
+                self.lose(f"{file.name} is left out: {error}")
+        if not self._storages:
+            raise BagError(f"{self.path}: none of its files can be read "
+                           f"({'; '.join(self.warnings)})")
         times = [time for storage in self._storages for time in storage.times or ()]
         if times:
             self.start_time, self.end_time = min(times), max(times) + 1
@@ -193,6 +160,21 @@ class Reader:
             raise BagError(f"{self.path}: damaged, and nothing could be recovered "
                            f"({'; '.join(self.warnings)})")
 
+    def _open_file(self, file: Path) -> None:
+        """Open one of the files of the recording."""
+        kind, plain = kind_of(file), file
+        if kind == PACKED:
+            plain = self._plain(file)
+            kind = kind_of(plain)
+        try:
+            if kind not in _STORAGES:
+                raise BagError(f"{plain}: unpacks to no recording")
+            storage = _STORAGES[kind](plain, self.lose, self.mention)
+        except BagError as error:
+            raise BagError(str(error).replace(str(plain), str(file))) from None
+        self._storages.append(storage)
+        self._add(storage)
+
     def open_source(self, description: str | Path | None = None) -> None:
         """Open what a device has written; see :func:`open_bag`."""
         known = format_of(self.path)
@@ -200,7 +182,13 @@ class Reader:
         if known is None and description is None:
             if self.path.is_dir():
                 raise BagError(f"{self.path}: a directory without .mcap or .db3 files is not a "
-                               "recording, and it holds no export of a device that is known")
+                               "recording" + (f": {METADATA_FILE} is there, and none of the files "
+                                              "that it describes"
+                                              if (self.path / METADATA_FILE).exists() else
+                                              ", and it holds no export of a device that is known"))
+            tool = unpacked_by(self.path)
+            if tool:
+                raise BagError(f"{self.path}: compressed; unpack it first ({tool})")
             raise BagError(f"{self.path}: not a recording; expected a rosbag2 directory, a .mcap, "
                            ".db3 or .bag file, or the export of a device. A table of numbers "
                            "needs a description: imu_fusion describe writes a first one")
@@ -242,8 +230,8 @@ class Reader:
         """Release the files."""
         for storage in self._storages:
             storage.close()
-        for file in self._temporary:
-            file.close()
+        for folder in self._temporary:
+            folder.cleanup()
         self._storages, self._temporary = [], []
 
     def messages(self, topics: Collection[str] | None = None, start: int | None = None,
@@ -269,7 +257,7 @@ class Reader:
         rows = in_order(parts) if len(parts) > 1 else parts[0].rows()
         try:
             for log_time, topic, data in rows:
-                if data[:4] == _ZSTD:
+                if data[:4] == ZSTD:    # rosbag2's --compression-mode message; CDR never does
                     unpacked = self._unpacked(topic, data)
                     if unpacked is None:
                         continue
@@ -357,6 +345,11 @@ class Reader:
                 self.lose(f"{storage.path.name}: topic {name} is {stored.msgtype} there, and "
                            f"{info.msgtype} in other files; read as the latter")
 
+    @property
+    def losses(self) -> list[str]:
+        """What is wrong with it, if anything is lost; as far as is known by now."""
+        return list(self.warnings) if self.damaged else []
+
     def lose(self, text: str) -> None:
         """Say, once, that a part of the recording cannot be used."""
         self.damaged = True
@@ -364,32 +357,32 @@ class Reader:
 
     def mention(self, text: str) -> None:
         """Say something, once, that costs no message."""
+        text = shown(text)
         if text not in self.warnings:
             self.warnings.append(text)
 
     def _plain(self, file: Path) -> Path:
         """A temporary unpacked copy of a file that was compressed as a whole."""
-        temporary = tempfile.NamedTemporaryFile(  # noqa: SIM115, closed by close
-            suffix="".join(file.suffixes[-2:]).removesuffix(_PACKED))
-        self._temporary.append(temporary)
+        folder = tempfile.TemporaryDirectory(prefix="imu_fusion_")    # cleaned up by close
+        self._temporary.append(folder)
+        plain = Path(folder.name, file.stem)
         bound = max(_LARGEST_RATIO * file.stat().st_size, largest_chunk())
         size = 0
         try:
-            with (open(file, "rb") as stream,
+            with (open(file, "rb") as stream, open(plain, "wb") as target,
                   zstandard.ZstdDecompressor().stream_reader(stream) as unpacked):
                 while data := unpacked.read(_PIECE):
                     size += len(data)
                     if size > bound:
                         raise BagError(f"{file}: unpacks to more than {_LARGEST_RATIO} times its "
                                        "size; unpack it yourself (zstd -d) if that is right")
-                    temporary.write(data)
+                    target.write(data)
         except zstandard.ZstdError as error:
             self.lose(f"{file.name}: damaged ({error}); what unpacks before is read")
-        temporary.flush()
         if not size:
             raise BagError(f"{file}: cannot be unpacked, it is no zstd file or damaged at its "
                            "beginning")
-        return Path(temporary.name)
+        return plain
 
     def _unpacked(self, topic: str, data: bytes) -> bytes | None:
         """A message that was compressed by itself; None, and a warning, if it is broken."""

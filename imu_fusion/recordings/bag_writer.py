@@ -55,7 +55,7 @@ class BagWriter:
     def __init__(self, directory: str | Path, compression: str = "zstd",
                  chunk_size: int = 256 * 1024, overwrite: bool = False,
                  whole: bool = False):
-        self._target = Path(directory).resolve()
+        self._target = Path(os.path.realpath(directory))
         self.directory = self._target
         self._replaced: Path | None = None    # where what was there is kept until the end
         self._folders: list[Path] = []        # that were made for it, innermost first

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,10 +23,10 @@ from imu_fusion.messages.layouts import (
     TWIST,
     Layout,
 )
-from imu_fusion.recordings.bag_reader import Reader, open_bag
+from imu_fusion.recordings.bag_reader import Lose, Reader, open_bag
+from imu_fusion.recordings.logs import decoded_blocks
 from imu_fusion.recordings.targets import make_parents, refuse_source, remove_empty
 
-_BLOCK = 2000    # messages that are decoded at once
 _XYZ = ("x", "y", "z")
 
 
@@ -92,10 +92,15 @@ _COLUMNS: tuple[Columns, ...] = (
              *_axes("angular_acceleration", "rad/s^2"),
              *_axes("sd_angular_acceleration", "rad/s^2")], _accel))
 _TABLES = {columns[0].msgtype: columns for columns in _COLUMNS}
+# Biases travel in the angular part of a twist.
+_BIAS_TOPIC = "imu/gyro_bias"
+_BIAS: Columns = (TWIST, [*_axes("gyro_bias", "rad/s"), *_axes("sd_gyro_bias", "rad/s")],
+                  lambda v: np.column_stack([v[:, TWIST["angular"]], _diagonal(
+                      v, TWIST["covariance"], 6, first=3)]))
 
 
 def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
-           forms: Collection[str] = ()) -> dict[str, int]:
+           forms: Collection[str] = (), lose: Lose = lambda text: None) -> dict[str, int]:
     """Write each topic that has numbers as a table.
 
     Args:
@@ -104,6 +109,7 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
             and in s since the first message of the recording; of poses also ``<topic>.tum`` (time,
             position, quaternion x y z w), of fixes ``<topic>.gpx``.
         forms: those of csv, tum and gpx to write; all, if empty.
+        lose: called with texts on what of the recording cannot be read.
 
     Returns:
         dict of file name to number of rows.
@@ -136,12 +142,15 @@ def export(path: str | Path, out: str | Path, topics: Collection[str] = (),
     finally:
         shutil.rmtree(part, ignore_errors=True)
         remove_empty(folders)
+    for text in reader.losses:
+        lose(text)
     return counts
 
 
 def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> dict[str, int]:
     """{file: rows} of the files of one topic."""
-    layout, names, values = _TABLES[reader.topics[topic].msgtype]
+    chosen = _BIAS if topic.endswith(_BIAS_TOPIC) else _TABLES[reader.topics[topic].msgtype]
+    layout, names, values = chosen
     stem = topic.strip("/").replace("/", "_")
     suffixes: dict[str, Any] = {".csv": _Csv(names)}
     if layout in (POSE, ODOMETRY):
@@ -157,7 +166,8 @@ def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> 
         for suffix, form in suffixes.items():
             files[suffix].write(form.head)
             counts[stem + suffix] = 0
-        for stamp, raw in _blocks(reader, topic, layout):
+        for block in decoded_blocks(reader, topic, layout):
+            stamp, raw = block.stamp, block.values
             table = values(raw)
             for suffix, form in suffixes.items():
                 lines = form.lines(stamp, stamp - reader.start_time, table, raw)
@@ -166,18 +176,6 @@ def _write(reader: Reader, topic: str, folder: Path, forms: Collection[str]) -> 
         for suffix, form in suffixes.items():
             files[suffix].write(form.tail)
     return counts
-
-
-def _blocks(reader: Reader, topic: str, layout: Layout) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(stamps (n,), decoded values (n, k)) of a topic, some at a time."""
-    waiting: list[bytes] = []
-    for *_, cdr in reader.messages([topic]):
-        waiting.append(cdr)
-        if len(waiting) == _BLOCK:
-            block, waiting = layout.decode_block(waiting), []
-            yield block.stamp, block.values
-    block = layout.decode_block(waiting)
-    yield block.stamp, block.values
 
 
 def _text(value: float) -> str:

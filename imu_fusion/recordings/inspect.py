@@ -112,13 +112,16 @@ def _conclude(reader: Reader, collectors: "Mapping[str, LogCollector | _Stamps]"
               whole: "Mapping[str, _Stretches]") -> None:
     """Look at what has been collected, and let it go."""
     reports = []
-    for name, collector in collectors.items():
-        msgtype = reader.topics[name].msgtype
-        reports.append(inspect_log(name, msgtype, collector.log())
-                       if isinstance(collector, LogCollector) else collector.report(name, msgtype))
-    imus = [report.log for report in reports if isinstance(report.log, ImuLog) and report.count]
-    for report in reports:
-        whole[report.topic].add(_with_axes(report, imus))
+    with np.errstate(over="ignore", invalid="ignore"):    # wild values are told of
+        for name, collector in collectors.items():
+            msgtype = reader.topics[name].msgtype
+            reports.append(inspect_log(name, msgtype, collector.log())
+                           if isinstance(collector, LogCollector) else
+                           collector.report(name, msgtype))
+        imus = [report.log for report in reports
+                if isinstance(report.log, ImuLog) and report.count]
+        for report in reports:
+            whole[report.topic].add(_with_axes(report, imus))
 
 
 class _Stretches:

@@ -1,10 +1,12 @@
 """Topics of a recording as typed logs, decoded while they are read."""
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from imu_fusion.errors import TopicError
 from imu_fusion.messages.convert import SAMPLE_TYPES, SampleType
+from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.samples.blocks import Growing
 from imu_fusion.samples.logs import Log
@@ -52,6 +54,21 @@ def undecodable(topic: str, refused: Mapping[str, int]) -> str:
     reason = next(iter(refused))
     return (f"{topic}: {sum(refused.values())} messages cannot be decoded and are left out "
             f"({reason})")
+
+
+def decoded_blocks(reader: Reader, topic: str, layout: Layout) -> Iterator[Decoded]:
+    """The messages of a topic, decoded some at a time; ``reader.warnings`` says of those that do
+    not fit their type."""
+    refused: dict[str, int] = {}
+    messages = reader.messages([topic])
+    while waiting := [cdr for *_, cdr in itertools.islice(messages, _BLOCK)]:
+        block = layout.decode_block(waiting)
+        for reason in block.refused.values():
+            refused[reason] = refused.get(reason, 0) + 1
+        if len(block.stamp):
+            yield block
+    if refused:
+        reader.lose(undecodable(topic, refused))
 
 
 def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = None) -> Any:

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.recordings.storage import DamageError, Window
+from imu_fusion.recordings.storage import Bytes, DamageError, Memory
 
 MAGIC = b"\x89MCAP0\r\n"
+NONE = 0                   # no opcode
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, DATA_END = 2, 3, 4, 5, 6, 7, 15
 _LAST = 15                 # opcode of the specification
 _PRIVATE = 128             # and beyond: of others, may be stepped over
@@ -25,6 +26,7 @@ HEAD = struct.Struct("<BQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 _AGREE = 3                 # records in a row that are not there by chance
+_SEARCHES = 10             # for records in one chunk
 SEARCH = 1 << 20           # bytes that are looked through at once
 
 
@@ -45,7 +47,7 @@ class Schema(NamedTuple):
     data: bytes
 
 
-def end_of(file: Window, position: int) -> int | None:
+def end_of(file: Bytes, position: int) -> int | None:
     """Where the record at ``position`` ends, None if there is none."""
     head = file.read(position, HEAD.size)
     if len(head) < HEAD.size:
@@ -60,7 +62,7 @@ def end_of(file: Window, position: int) -> int | None:
     return end if _adds_up(file, opcode, position + HEAD.size, length) else None
 
 
-def _adds_up(file: Window, opcode: int, position: int, length: int) -> bool:
+def _adds_up(file: Bytes, opcode: int, position: int, length: int) -> bool:
     """Whether the lengths inside of a record make its own."""
     if opcode == CHUNK:
         head = file.read(position, 72)
@@ -81,7 +83,7 @@ def _adds_up(file: Window, opcode: int, position: int, length: int) -> bool:
     return True
 
 
-def is_followed(file: Window, position: int, end: int) -> bool:
+def is_followed(file: Bytes, position: int, end: int) -> bool:
     """Whether a message outside of chunks, which nothing else vouches for, ends where another
     record begins, or the file does."""
     if file.read(position, 1)[0] != MESSAGE or end == file.size:
@@ -96,7 +98,7 @@ def is_followed(file: Window, position: int, end: int) -> bool:
             and end + HEAD.size + length > file.size)   # the cut end of a file
 
 
-def find_record(file: Window, start: int) -> int:
+def find_record(file: Bytes, start: int) -> int:
     """Position of the first record at or after ``start``, the size of the file without one."""
     while start < file.size - HEAD.size:
         data = file.read(start, SEARCH)
@@ -114,7 +116,7 @@ def find_record(file: Window, start: int) -> int:
     return file.size
 
 
-def _is_record(file: Window, position: int) -> bool:
+def _is_record(file: Bytes, position: int) -> bool:
     """Whether enough records follow from ``position`` on not to be chance."""
     opcode = file.read(position, 1)[0]
     for _ in range(_AGREE):
@@ -131,27 +133,34 @@ def _is_record(file: Window, position: int) -> bool:
 
 def records(data: bytes) -> Iterator[tuple[int, memoryview]]:
     """(opcode, content) of the records of a chunk, as far as they are what may be in one: a chunk
-    of zeros is no million of records."""
-    view, position = memoryview(data), 0
-    while position + HEAD.size <= len(data):
-        opcode, length = HEAD.unpack_from(data, position)
-        position += HEAD.size
-        if opcode not in _IN_CHUNK or not _LENGTHS[opcode][0] <= length <= len(data) - position:
-            return
-        yield opcode, view[position:position + length]
-        position += length
+    of zeros is no million of records. What is none comes with the opcode NONE."""
+    view, position, searches = memoryview(data), 0, 0
+    while position < len(data):
+        opcode, length = (HEAD.unpack_from(data, position) if position + HEAD.size <= len(data)
+                          else (NONE, 0))
+        content = position + HEAD.size
+        if opcode in _IN_CHUNK and _LENGTHS[opcode][0] <= length <= len(data) - content:
+            yield opcode, view[content:content + length]
+            position = content + length
+            continue
+        # Bounded: what looks like records that may not be in a chunk would be searched for ever.
+        searches += 1
+        following = (find_record(Memory(data), position + 1) if searches <= _SEARCHES
+                     else len(data))
+        yield NONE, view[position:following]
+        position = following
 
 
 def define(opcode: int, content: bytes | memoryview, channels: dict[int, Channel],
            schemas: dict[int, Schema]) -> None:
-    """Put the definition in a record (SCHEMA or CHANNEL) under its number; DamageError, if its
-    lengths do not add up."""
+    """Put the definition in a record (SCHEMA or CHANNEL) under its number, if that has none yet;
+    DamageError, if its lengths do not add up."""
     if opcode == SCHEMA:
         number, schema = _schema(content)
-        schemas[number] = schema
+        schemas.setdefault(number, schema)
     else:
         number, channel = _channel(content)
-        channels[number] = channel
+        channels.setdefault(number, channel)
 
 
 def _schema(content: bytes | memoryview) -> tuple[int, Schema]:

@@ -26,6 +26,7 @@ from imu_fusion.recordings.mcap_records import (
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
+    NONE,
     SCHEMA,
     SEARCH,
     Channel,
@@ -164,6 +165,9 @@ class McapStorage(FileStorage):
         elif opcode in (SCHEMA, CHANNEL):
             channels, schemas = self._index if self._in_index else (self._channels, self._schemas)
             define(opcode, self._file.read(content, end - content), channels, schemas)
+            if not self._in_index:    # read with the messages: one may contradict an earlier one
+                block = self._open_run(position)
+                block.size = block.unpacked = end - block.position
         elif opcode == DATA_END:
             self._in_index = True
         elif opcode == FOOTER:
@@ -190,7 +194,7 @@ class McapStorage(FileStorage):
         block.saw(int(times.min()), int(times.max()))
 
     def _open_run(self, position: int) -> _Block:
-        """The block of a message outside of chunks."""
+        """The block of a record outside of chunks."""
         block = self._blocks[-1] if self._blocks else None
         if (block is None or block.compression is not None or block.size > _TOGETHER
                 or block.position + block.size != position):
@@ -215,6 +219,8 @@ class McapStorage(FileStorage):
         channels, schemas = self._index
         self._channels = channels | self._channels
         self._schemas = schemas | self._schemas
+        # Of a damaged chunk: good as long as nothing sound contradicts them.
+        doubtful: tuple[dict[int, Channel], dict[int, Schema]] = {}, {}
         tries: dict[int, int] = {}
         for block in self._blocks:
             if block.compression is None:
@@ -224,24 +230,27 @@ class McapStorage(FileStorage):
             if block.counts and not unknown:
                 continue
             counted = bool(block.counts)
+            known = self._channels, self._schemas
             try:
                 data = self._unpacked(block)
             except DamageError as error:
                 self._lose_chunk(block, error)
                 if block.compression:
                     continue
-                counted = True
+                counted, known = True, doubtful
                 data = self._file.read(block.position, block.size)    # definitions may be sound
             for number in unknown:
                 tries[number] = tries.get(number, 0) + 1
             for opcode, content in records(data):
                 if opcode in (SCHEMA, CHANNEL):
                     with contextlib.suppress(DamageError):
-                        define(opcode, content, self._channels, self._schemas)
+                        define(opcode, content, *known)
                 elif opcode == MESSAGE and not counted and len(content) >= MESSAGE_HEAD.size:
                     number, _, log_time, _ = MESSAGE_HEAD.unpack_from(content)
                     block.counts[number] = block.counts.get(number, 0) + 1
                     block.saw(log_time, log_time)
+        self._channels = doubtful[0] | self._channels
+        self._schemas = doubtful[1] | self._schemas
 
     def _type_of(self, channel: Channel) -> str:
         """The message type of a channel; empty, if it is no topic of ROS 2."""
@@ -262,6 +271,11 @@ class McapStorage(FileStorage):
         several: dict[str, set[str]] = {}
         for number, channel in self._channels.items():
             name, schema = self._type_of(channel), self._schemas.get(channel.schema)
+            if schema is None and channel.schema:
+                self.lose(f"{self.path.name}: the type of topic {channel.topic} (schema "
+                          f"{channel.schema}) is not in the file; {counts.get(number, 0)} "
+                          "messages are left out")
+                continue
             if not name or schema is None:
                 kind = channel.encoding or "no encoding"
                 self.left_out.append(f"{channel.topic or 'a channel without name'} ({kind})")
@@ -329,8 +343,13 @@ class McapStorage(FileStorage):
         except DamageError as error:
             self._lose_chunk(block, error)
             return iter(())
-        rows = []
+        rows, found, damaged = [], 0, 0
         for opcode, content in records(data):
+            found += opcode == MESSAGE
+            if opcode == NONE:
+                damaged += len(content)
+            elif opcode in (SCHEMA, CHANNEL):
+                self._drop_redefined(opcode, content, wanted)
             if opcode != MESSAGE or len(content) < MESSAGE_HEAD.size:
                 continue
             number, _, log_time, _ = MESSAGE_HEAD.unpack_from(content)
@@ -338,5 +357,25 @@ class McapStorage(FileStorage):
             if topic is not None and (start is None or log_time >= start) and (
                     stop is None or log_time < stop):
                 rows.append((log_time, topic, bytes(content[MESSAGE_HEAD.size:])))
+        if damaged:
+            missing = sum(block.counts.values()) - found
+            self.lose(f"{self.path.name}: {damaged} bytes in a chunk at byte {block.position} are "
+                      f"damaged; {missing if missing > 0 else 'some'} messages of "
+                      f"{span(block.first, block.last)} are missing")
         rows.sort(key=lambda row: row[0])
         return iter(rows)
+
+    def _drop_redefined(self, opcode: int, content: memoryview, wanted: dict[int, str]) -> None:
+        """Read no more of channels that a definition contradicts: what comes after it is of another
+        topic, or of another type."""
+        channels: dict[int, Channel] = {}
+        schemas: dict[int, Schema] = {}
+        with contextlib.suppress(DamageError):
+            define(opcode, content, channels, schemas)
+        for number, channel in self._channels.items():
+            schema = self._schemas.get(channel.schema)
+            if number in wanted and (
+                    channels.get(number, channel)[:3] != channel[:3]
+                    or schema and schemas.get(channel.schema, schema)[:2] != schema[:2]):
+                self.lose(f"{self.path.name}: channel {number} ({wanted.pop(number)}) is defined "
+                          "anew with another topic or type; its messages after that are left out")

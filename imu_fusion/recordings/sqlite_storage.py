@@ -4,6 +4,7 @@ Messages are read in order of log time through the index of the file. Where a pa
 damaged, what is left is fetched row by row, and the rows that cannot be read are counted.
 """
 
+import os
 import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -26,18 +27,28 @@ class SqliteStorage(Storage):
     def __init__(self, path: Path, lose: Callable[[str], object],
                  mention: Callable[[str], object]) -> None:
         super().__init__(path, lose, mention)
-        address = f"file:{quote(str(path.resolve()))}?mode=ro"
-        self._database = sqlite3.connect(address, uri=True, check_same_thread=False)
-        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(largest_chunk(), 10**9))
-        self._database.text_factory = lambda data: data.decode("utf-8", "replace")
-        self._numbers: dict[int, str] = {}
-        try:
-            self._make_topics()
-            self._count()
-        except sqlite3.Error as error:
-            self._database.close()
-            raise BagError(f"{path}: no recording of rosbag2, or damaged at its beginning "
-                           f"({error})") from None
+        beside = [file.name for file in (Path(f"{path}-wal"), Path(f"{path}-journal"))
+                  if file.exists() and file.stat().st_size]
+        # Immutable: sqlite neither looks for files beside it nor makes any, as it would even to
+        # read; with what a killed recorder has left there it must, if it can.
+        for options in (("mode=ro", "immutable=1") if beside else ("immutable=1",)):
+            self._database = sqlite3.connect(
+                f"file:{quote(os.path.realpath(path))}?{options}", uri=True,
+                check_same_thread=False)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(largest_chunk(), 10**9))
+            self._database.text_factory = lambda data: data.decode("utf-8", "replace")
+            try:
+                self._open()
+                return
+            except sqlite3.Error as error:
+                self._database.close()
+                reason = str(error)
+            if options != "immutable=1":
+                self.lose(f"{path.name}: {', '.join(beside)} cannot be used ({reason}); what is "
+                          "only there is missing")
+        raise BagError(f"{path}: no recording of rosbag2, or damaged at its beginning ({reason})"
+                       + (f"; a {path.name}-wal that was beside it belongs to it"
+                          if "no such table" in reason and not beside else ""))
 
     def close(self) -> None:
         self._database.close()
@@ -58,10 +69,31 @@ class SqliteStorage(Storage):
                 done = (stamp, row)
                 if isinstance(data, bytes) and isinstance(stamp, int):
                     yield max(stamp, 0), wanted[number], data
+                else:
+                    self.lose(f"{self.path.name}: messages of {wanted[number]} are no bytes and "
+                              "left out")
         except (sqlite3.Error, OverflowError, MemoryError) as error:
-            self.lose(f"{self.path.name}: damaged after {span(done[0] or None, None)} ({error}); "
-                      "the rest is fetched row by row")
+            where = span(done[0], None) if done[1] >= 0 else "all of it"
+            self.lose(f"{self.path.name}: damaged ({error}); what is left, {where}, is fetched row "
+                      "by row")
             yield from self._salvage(wanted, done, high)
+
+    def _open(self) -> None:
+        self.topics.clear()
+        self._numbers: dict[int, str] = {}
+        self._others: set[int] = set()    # topics that are known and left out
+        try:
+            kinds = dict(self._database.execute(
+                "select name, type from sqlite_master where name in ('topics', 'messages')"))
+        except sqlite3.DatabaseError:    # shorter than it says: sqlite would read nothing of it
+            self._database.execute("pragma writable_schema = on")
+            kinds = dict(self._database.execute(
+                "select name, type from sqlite_master where name in ('topics', 'messages')"))
+            self.lose(f"{self.path.name}: cut off, or damaged at its beginning")
+        if any(kind != "table" for kind in kinds.values()):    # a view may be without end
+            raise sqlite3.DatabaseError("topics and messages are no tables")
+        self._make_topics()
+        self._count()
 
     def _make_topics(self) -> None:
         columns = {row[1] for row in self._database.execute("pragma table_info(topics)")}
@@ -73,10 +105,12 @@ class SqliteStorage(Storage):
             name, msgtype = str(name), str(msgtype)
             if encoding != "cdr" or not name:
                 self.left_out.append(f"{name} ({encoding})")
+                self._others.add(number)
                 continue
             if name in self.topics and self.topics[name].msgtype != msgtype:
                 self.lose(f"topic {name} holds several types and is read as "
                           f"{self.topics[name].msgtype}")
+                self._others.add(number)
                 continue
             self._numbers[number] = name
             text = texts.get(msgtype)
@@ -98,6 +132,9 @@ class SqliteStorage(Storage):
                     "select topic_id, count(*) from messages group by topic_id"):
                 if number in self._numbers:
                     self.topics[self._numbers[number]].count += count
+                elif number not in self._others:
+                    self.lose(f"{self.path.name}: {count} messages are of a topic ({number}) that "
+                              "is not listed; they are left out")
             first, last = self._database.execute(
                 "select min(timestamp), max(timestamp) from messages").fetchone()
             if isinstance(first, int) and isinstance(last, int):

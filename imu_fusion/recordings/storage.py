@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import lz4.frame
 import zstandard
@@ -66,6 +66,27 @@ class Storage:
 
     def close(self) -> None:
         """Release the file."""
+
+
+class Bytes(Protocol):
+    """``size`` bytes of which parts can be read."""
+
+    size: int
+
+    def read(self, position: int, size: int) -> bytes:
+        """The ``size`` bytes at ``position``; fewer where they end."""
+        ...
+
+
+class Memory:
+    """Bytes that are in memory."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self.size = data, len(data)
+
+    def read(self, position: int, size: int) -> bytes:
+        """The ``size`` bytes at ``position``; fewer where they end."""
+        return self._data[position:position + size]
 
 
 class Window:

@@ -1,6 +1,7 @@
 """Several recordings beside each other: their results.json as the rows of one table."""
 
 import csv
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ def names_of(bags: Iterable[str | Path]) -> dict[str, str | Path]:
     """
     names: dict[str, str | Path] = {}
     for bag in bags:
-        name = Path(bag).resolve().stem
+        name = Path(os.path.realpath(bag)).stem
         if name in names:
             raise BagError(f"{bag}: called {name}, as {names[name]} is; their estimates would go "
                            "to one place. Rename one, or process them one by one")
@@ -57,6 +58,8 @@ def write_summary(folder: Path, names: Iterable[str]) -> Path:
 def _numbers(found: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
     """Numbers in nested results, with their names joined by dots; of texts, how many there are."""
     for key, value in found.items():
+        if key == "units":
+            continue
         name = f"{above}{key}"
         if isinstance(value, Mapping):
             yield from _numbers(value, f"{name}.")

@@ -26,7 +26,7 @@ def refuse_source(source: str | Path, out: str | Path) -> None:
         BagError: ``out`` is the source, contains it or lies in it; also through symbolic links,
             and where both hold the same file under two names (hard links).
     """
-    source, out = Path(source).resolve(), Path(out).resolve()
+    source, out = (Path(os.path.realpath(path)) for path in (source, out))    # also through loops
     if source == out or source in out.parents or out in source.parents or (
             out.exists() and set(_identities(source)) & set(_identities(out))):
         raise BagError(f"{out}: is, contains or lies in the source {source}, which would be "

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_fusion.errors import shown
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
 from imu_fusion.samples.turning import check_turning
@@ -308,7 +309,7 @@ def check_frames(frame_ids: Collection[str], name: str) -> list[Finding]:
     if len(named) < 2:
         return []
     return [Finding("frame", f"{name}: messages of {len(named)} frames ("
-                             + ", ".join(f"'{frame}'" for frame in named[:4])
+                             + ", ".join(f"'{shown(frame, 60)}'" for frame in named[:4])
                              + "): several sensors on one topic; give each one of its own",
                     unusable=True)]
 

@@ -341,6 +341,9 @@ class PhyphoxLive(Source):
                 OverflowError) as error:
             if isinstance(error, SampleError):
                 raise
+            if part.startswith("/config"):
+                raise SampleError("the answer to /config is not phyphox's; is it the phone that "
+                                  "has this address?") from None
             self.lose("answers that are not phyphox's", part[:20])
         return []
 

@@ -33,6 +33,7 @@ class Format:
     Attributes:
         name: of the parameter ``source`` of the driver. about: in words.
         recognises: whether these are the beginnings of its files.
+        schemes: beginnings of the addresses of the transports that bring its stream.
         file, live: make the Source of a file, and of a stream, given ``platform`` and the like from
             the description; None where there is none.
     """
@@ -43,6 +44,7 @@ class Format:
     file: Callable[..., Source] | None = None
     live: Callable[..., Source] | None = None
     options: tuple[str, ...] = ()
+    schemes: tuple[str, ...] = ("serial", "tcp", "udp")
 
 
 def _csvs(heads: Heads) -> dict[str, bytes]:
@@ -114,9 +116,10 @@ def _describe_themselves(heads: Heads) -> bool:
 
 FORMATS = {known.name: known for known in (
     Format("phyphox", "phyphox, a phone's sensors (CSV or Excel, or its remote interface)",
-           _is_phyphox, PhyphoxExport, PhyphoxLive),
+           _is_phyphox, PhyphoxExport, PhyphoxLive, schemes=("http",)),
     Format("sensor_logger", "Sensor Logger, a phone's sensors (CSV, or pushed by HTTP)",
-           _is_sensor_logger, SensorLoggerExport, SensorLoggerPush, ("platform",)),
+           _is_sensor_logger, SensorLoggerExport, SensorLoggerPush, ("platform",),
+           ("http-push",)),
     Format("avanode_imu", "AvaNode, log of the IMU", _is_avanode_imu, AvanodeImu),
     Format("avanode_gnss", "AvaNode, log of the GNSS receiver", _starts(b"#microcontroller time"),
            AvanodeGnss),
@@ -153,9 +156,23 @@ def live_source(name: str, description: Mapping[str, Any] | None, where: str) ->
         return TableSource(Description.from_mapping(description, where), strict=False)
     known = FORMATS.get(name)
     if known is None or known.live is None:
-        raise ParameterError(f"source '{name}' cannot be read live; there are: " + ", ".join(
+        raise ParameterError((f"source '{name}' cannot be read live" if name else
+                              "no source is given") + "; there are: " + ", ".join(
             [n for n, f in FORMATS.items() if f.live is not None] + ["table"]))
     return known.live(strict=False, **_options(known, description, where))
+
+
+def check_transport(name: str, address: str) -> None:
+    """Refuse a transport that cannot bring the stream of a format.
+
+    Raises:
+        ParameterError: names those that can.
+    """
+    schemes = FORMATS[name].schemes
+    scheme = address.partition("://")[0]
+    if scheme not in schemes and any(scheme in known.schemes for known in FORMATS.values()):
+        raise ParameterError(f"transport '{address}': source {name} comes through "
+                             + " or ".join(f"{known}://" for known in schemes))
 
 
 def file_source(known: Format, description: Mapping[str, Any] | None = None,

@@ -19,6 +19,7 @@ from imu_fusion.estimation.orientation.recovered import recover
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.estimation.smoother.state import BLOCKS
 from imu_fusion.messages.convert import SAMPLE_TYPES, fix_messages
 from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message, diagnostics_value
 from imu_fusion.messages.layouts import (
@@ -278,6 +279,18 @@ def recovery_params(params: SmootherParams) -> OrientationParams:
         **{f"sensor.{name}": getattr(params.sensor, name) for name in shared}})
 
 
+_SI = {"µT": "T", "%": "1", "ms": "s", "°": "rad"}    # of units in reports
+UNITS = {
+    "latitude_deg": "deg", "longitude_deg": "deg", "height": "m", "gnss_lag": "s", "offset": "m",
+    "stamp": "ns", "duration": "s",
+    **dict.fromkeys(("takeoff_stamp", "touchdown_stamp"), "ns"),
+    **dict.fromkeys(("in_run_speed", "takeoff_speed", "landing_speed"), "m/s"),
+    "takeoff_angle_deg": "deg", "flight_time": "s", "length": "m",
+    **{block.name: _SI.get(block.unit, block.unit) for block in BLOCKS}}
+"""Units of an Outcome's numbers and of the values of its states; those of ``<name>_sd``, and of
+``sd`` beside a value, are the same. What is not named here is a count or a ratio."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a result says in words and plain numbers: ``summary`` one line, ``numbers`` for JSON,
@@ -292,7 +305,7 @@ class Outcome:
     def of(cls, result: SmootherResult, frame_id: str) -> Self:
         """Of a SmootherResult."""
         numbers: dict[str, Any] = {
-            "samples": len(result.samples), "origin": asdict(result.frame),
+            "units": UNITS, "samples": len(result.samples), "origin": asdict(result.frame),
             "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,

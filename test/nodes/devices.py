@@ -38,6 +38,7 @@ TABLE = {"header": False, "time": {"column": "1", "unit": "us"},
          "gyroscope": {"columns": ["2", "3", "4"], "unit": "deg/s"},
          "accelerometer": {"columns": ["5", "6", "7"], "unit": "g"}}
 COUNT = 400
+TEN_MINUTES = 600 * 400    # samples at 400 Hz
 
 
 def lines(count=COUNT):
@@ -153,6 +154,22 @@ def _tcp(*vanish):
     sys.stdin.readline()
 
 
+def _long():
+    """An x-IMU3 that tells ten minutes, each second of them when it is asked to: a live topic does
+    not wait for its subscribers."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    say(f"tcp://127.0.0.1:{listener.getsockname()[1]}")
+    connection, _ = listener.accept()
+    rest = b""
+    for second in range(600):
+        data = rest + inertial(400, 1_000_000 * second)
+        connection.sendall(data[:-10])    # its last message ends with the next one
+        rest = data[-10:]
+        sys.stdin.readline()
+    connection.sendall(rest)
+    sys.stdin.readline()
+
+
 def _clock(rate, drift, jump):
     """An x-IMU3 in real time whose clock drifts (ppm), and jumps by so many s in the middle."""
     listener = socket.create_server(("127.0.0.1", 0))
@@ -187,7 +204,8 @@ def _udp(port):
 
 
 KINDS = {"phyphox": _phyphox, "sensor_logger": _sensor_logger, "ubx": _serial, "ximu3": _tcp,
-         "table": _udp, "vanishing": functools.partial(_tcp, "vanish"), "clock": _clock}
+         "table": _udp, "vanishing": functools.partial(_tcp, "vanish"), "long": _long,
+         "clock": _clock}
 
 
 if __name__ == "__main__":

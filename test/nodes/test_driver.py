@@ -1,9 +1,11 @@
 """The driver with the device's side played by processes: what comes is what the device has."""
 
+import contextlib
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -24,7 +26,8 @@ from imu_fusion.nodes.driver import Driver
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
-from test.nodes.devices import TABLE, truth
+from imu_fusion.sources.source import EPOCH
+from test.nodes.devices import TABLE, TEN_MINUTES, truth
 from test.nodes.test_processes import ENVIRONMENT
 from test.sources.logs import same
 from test.sources.test_formats import TIME, export
@@ -68,11 +71,16 @@ class Listener:
     def __init__(self, graph, topics):
         node = graph.node("listener")
         self.messages = {topic: [] for topic in topics}
-        for topic in topics:
-            node.create_subscription(message_class(LAYOUTS[topic].msgtype), topic,
-                                     self.messages[topic].append, ALL, raw=True)
+        self._subscriptions = {topic: node.create_subscription(
+            message_class(LAYOUTS[topic].msgtype), topic, self.messages[topic].append, ALL,
+            raw=True) for topic in topics}
 
     def has(self, expected):
+        for topic, subscription in self._subscriptions.items():    # an executor takes one a turn
+            handle = subscription.handle
+            with handle:
+                while (taken := handle.take_message(subscription.msg_type, True)) is not None:
+                    self.messages[topic].append(taken[0])
         return all(len(self.messages[topic]) >= len(log) for topic, log in expected.items())
 
     def logs(self):
@@ -125,6 +133,23 @@ def test_live_is_what_the_export_of_the_device_holds(graph, description, kind, a
         assert bool(lost) == (kind in ("ubx", "vanishing")), lost
 
 
+@pytest.mark.slow
+def test_ten_minutes_at_400_hz_lose_nothing_and_give_nothing_twice(graph):
+    listener = Listener(graph, ["imu/data_raw"])
+    with Device("long") as device:
+        driver = start(graph, "ximu3", device.address, ["imu/data_raw"], stamp_source="device_raw")
+        for second in range(1, 601):
+            graph.until(lambda n=second: listener.has({"imu/data_raw": range(400 * n - 1)}), 30.0)
+            device.go()
+        graph.until(lambda: listener.has({"imu/data_raw": range(TEN_MINUTES)}), 30.0)
+        for _ in range(100):    # nothing follows
+            driver.work()
+            graph.executor.spin_once(timeout_sec=0.0)
+    (log,) = listener.logs().values()
+    assert np.array_equal(log.stamp, EPOCH + 2_500_000 * np.arange(TEN_MINUTES))
+    assert not driver._source.lost
+
+
 def test_a_device_that_is_absent_is_waited_for_and_said_once(graph):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -175,6 +200,30 @@ def test_covariances_mean_something_and_diagnostics_name_the_device(graph):
     assert cov[0] == pytest.approx(1e-6 * 400.0)    # 400 Hz
 
 
+@pytest.mark.parametrize("answer, words", [
+    (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "answers 404 Not Found"),
+    (b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\n\r\nhome", "not phyphox's")])
+def test_what_is_no_phone_is_one_line_however_often_it_is_asked(graph, capfd, answer, words):
+    times = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        def serve():
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    times.append(connection)
+                    with contextlib.suppress(OSError):
+                        while connection.recv(4096):
+                            times.append(connection.sendall(answer))
+
+        threading.Thread(target=serve, daemon=True).start()
+        driver = start(graph, "phyphox", f"http://127.0.0.1:{server.getsockname()[1]}", [])
+        graph.until(lambda: len(times) >= 6 and (driver._problem or driver._said), 60.0)
+    said = capfd.readouterr()
+    lines = [line for line in (said.out + said.err).splitlines() if "[WARN]" in line]
+    assert len(lines) == 1 and words in lines[0], lines
+    assert (said.out + said.err).count(": connected") == 1
+
+
 def test_another_format_is_named(graph, capfd):
     with Device("ubx") as device:
         driver = start(graph, "ximu3", device.address, [])
@@ -187,6 +236,9 @@ def test_another_format_is_named(graph, capfd):
 
 @pytest.mark.parametrize("parameters, words", [
     ({}, "transport"), ({"transport": "tcp://x:1", "source": "foo"}, "'foo' cannot be read live"),
+    ({"transport": "tcp://x:1"}, "no source is given; there are: phyphox, "),
+    ({"transport": "http://x:1", "source": "sensor_logger"}, "comes through http-push://"),
+    ({"transport": "http://x:1", "source": "ximu3"}, "comes through serial:// or tcp:// or udp"),
     ({"transport": "gopher://x:1", "source": "ubx"}, "expected serial://"),
     ({"transport": "tcp://x", "source": "ubx"}, "expected tcp://HOST:PORT"),
     ({"transport": "serial:///dev/null?baud=12", "source": "ubx"}, "12 baud"),
@@ -224,7 +276,7 @@ def test_driver_estimator_and_recorder_as_processes(tmp_path, monkeypatch):
         executor.add_node(watcher)
 
         def until(condition):
-            deadline = time.monotonic() + 120.0
+            deadline = time.monotonic() + 300.0
             while not condition():
                 assert time.monotonic() < deadline, nodes.log("driver")
                 executor.spin_once(timeout_sec=0.1)
@@ -246,12 +298,13 @@ def test_driver_estimator_and_recorder_as_processes(tmp_path, monkeypatch):
         assert same({"": read_log(reader, "imu/data_raw")}, {"": expected})
 
 
-@pytest.mark.parametrize("transport", [
-    "tcp://127.0.0.1:9", "udp://127.0.0.1:{port}", "serial:///dev/nowhere",
-    "http://127.0.0.1:9", "http-push://127.0.0.1:{port}"])
-def test_sigint_ends_it_in_every_state(transport):
+@pytest.mark.parametrize("source, transport", [
+    ("ubx", "tcp://127.0.0.1:9"), ("ubx", "udp://127.0.0.1:{port}"),
+    ("ubx", "serial:///dev/nowhere"), ("phyphox", "http://127.0.0.1:9"),
+    ("sensor_logger", "http-push://127.0.0.1:{port}")])
+def test_sigint_ends_it_in_every_state(source, transport):
     command = [sys.executable, "-m", "imu_fusion.cli", "run", "driver", "--ros-args", "-p",
-               "source:=ubx", "-p", f"transport:={transport.format(port=free_port())}"]
+               f"source:={source}", "-p", f"transport:={transport.format(port=free_port())}"]
     process = subprocess.Popen(command, env=ENVIRONMENT | {"PYTHONUNBUFFERED": "1"}, cwd=ROOT,
                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     line = process.stdout.readline()

@@ -213,6 +213,22 @@ def test_who_was_waited_for_may_leave_and_others_join(graph):
     assert late.values == [100, 101]
 
 
+def test_node_between_whose_sender_dies_waits_for_nobody_that_only_that_one_knew(graph):
+    """It would be deaf to all senders after it."""
+    mute, doubler = Receiver(graph, "mute", hold=lambda: True), Doubler(graph)
+    sender = Sender(graph, wait_for=["doubler"])
+    sender.session(10)
+    graph.until(lambda: "/mute" in doubler.flow.source.waiting_for())
+    graph.until(lambda: mute.flow.peers.own in doubler.flow.sink.company())
+    graph.remove(sender.node)
+    graph.remove(mute.node)
+    receiver, again = Receiver(graph, topic="/doubled"), Sender(graph, "again",
+                                                                wait_for=["doubler"])
+    again.session(10)
+    graph.until(again.source.drained)
+    graph.until(lambda: receiver.values[-21:] == twice(10))
+
+
 def test_restarted_under_its_name_it_is_somebody_else(graph):
     stays = Receiver(graph, "stays")
     first = Receiver(graph, "receiver")

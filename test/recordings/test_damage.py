@@ -1,7 +1,9 @@
 """Damaged and hostile recordings: what is sound is read, what is lost is said, nothing else
 happens. Broken files of each kind by the thousand: ``python -m benchmarks.fuzz``."""
 
+import gzip
 import json
+import os
 import random
 import shutil
 import sqlite3
@@ -20,10 +22,11 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from benchmarks.fuzz import KINDS, mutated, outcome, write_db3, write_mcap, write_ros1
+from imu_fusion.calibrate.files import read_topic
 from imu_fusion.cli import cli
 from imu_fusion.errors import INCOMPLETE, BagError
 from imu_fusion.messages.convert import fix_message, imu_message
-from imu_fusion.messages.layouts import FIX, IMU
+from imu_fusion.messages.layouts import FIX, IMU, MAG
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.nodes.pipeline import find_left_out, plan_pipeline
 from imu_fusion.recordings import mcap_records, ros1_storage
@@ -216,6 +219,11 @@ def chunk(compression, packed, size, crc=0):
         compression.encode() + struct.pack("<Q", len(packed)) + packed)
 
 
+def in_chunk(*records):
+    content = b"".join(struct.pack("<BQ", op, len(c)) + c for op, c in records)
+    return chunk("", content, len(content))
+
+
 @pytest.mark.parametrize("definition", [
     "a/A x", "float64 " * 5000, "\0\xff", "float64[99999999999] x", "float64 x\n" * 3000,
     "string class\nint8 __init__"])
@@ -251,9 +259,11 @@ def test_names_that_are_none_are_not_shown_raw(tmp_path, name):
 # Lengths.
 
 def test_a_chunk_unpacks_within_a_bound_that_can_be_raised(tmp_path, monkeypatch):
-    size = 60_000_000
-    for name, packed in (("zstd", zstandard.compress(bytes(size))),
-                         ("lz4", lz4.frame.compress(bytes(size)))):
+    opcode, content = schema("a/msg/A", " " * 60_000_000, 2)
+    unpacked = struct.pack("<BQ", opcode, len(content)) + content
+    size = len(unpacked)
+    for name, packed in (("zstd", zstandard.compress(unpacked)),
+                         ("lz4", lz4.frame.compress(unpacked))):
         file = mcap(tmp_path / f"{name}.mcap", schema(IMU.msgtype), channel("/imu"),
                     message(imu(0)), chunk(name, packed, size))
         assert through("info", file, None).exit_code == 0
@@ -270,7 +280,7 @@ def test_a_chunk_unpacks_within_a_bound_that_can_be_raised(tmp_path, monkeypatch
 
 
 def test_a_chunk_of_zeros_is_no_million_of_records(tmp_path):
-    assert not list(mcap_records.records(bytes(100)))
+    assert list(mcap_records.records(bytes(100))) == [(mcap_records.NONE, bytes(100))]
     with pytest.raises(DamageError):
         next(ros1_storage._records(bytes(100)))
 
@@ -315,6 +325,12 @@ def test_a_broken_message_among_many_stops_no_door_and_is_counted_alike(tmp_path
         assert len(read_log(reader, "imu/data_raw")) == 399 and reader.damaged
     assert through("convert", bag, tmp_path / "copy").exit_code == 0    # its bytes as they are
     assert run("report", bag, "--out", tmp_path / "r.html").exit_code == INCOMPLETE
+    exported = run("export", bag, tmp_path / "tables")
+    assert exported.exit_code == INCOMPLETE and "1 messages cannot be decoded" in exported.output
+    lost = []
+    log, fix, remarks = read_topic(bag, "imu/data_raw", lost.append)    # of every calibration
+    assert len(log) == 397 and len(fix) == 1 and len(remarks) == 2
+    assert len(lost) == 1 and "1 messages cannot be decoded" in lost[0]
 
 
 @pytest.mark.parametrize("log_time", [0, 1, 2**63, 2**64 - 1])
@@ -363,6 +379,141 @@ def test_metadata_is_a_hint(tmp_path):
     shutil.copy(bag / "bag_0.mcap", bag / "bag_1.mcap")
     rows, reader = rows_of(bag)
     assert len(rows) == 40 and "bag_1.mcap is not named" in reader.warnings[0]
+
+
+def test_a_file_of_a_split_recording_that_is_none_costs_no_other(tmp_path):
+    bag = write(tmp_path / "bag", 30)
+    before, _ = rows_of(bag)
+    (bag / "metadata.yaml").unlink()
+    (bag / "bag_1.mcap").write_bytes(b"garbage" * 100)
+    (bag / "bag_2.mcap").write_bytes(b"")
+    after, reader = rows_of(bag)
+    assert after == before and reader.damaged
+    assert "bag_1.mcap is left out" in " ".join(reader.warnings)
+    (bag / "bag_0.mcap").unlink()
+    result = through("info", bag, None)
+    assert result.exit_code == 1 and "none of its files can be read" in result.output
+
+
+@pytest.mark.parametrize("make, name", [
+    (lambda f: write_mcap(f, "zstd"), "t.bag"), (write_db3, "t.mcap"), (write_ros1, "t.bag.active"),
+    (lambda f: write_mcap(f, "none"), "recording")])
+def test_the_first_bytes_say_what_a_file_is(tmp_path, make, name):
+    file = make(tmp_path)
+    before, _ = rows_of(file)
+    after, reader = rows_of(file.rename(tmp_path / name))
+    assert after == before and not reader.damaged
+    (tmp_path / "t.zst").write_bytes(zstandard.compress((tmp_path / name).read_bytes()))
+    assert rows_of(tmp_path / "t.zst")[0] == before
+
+
+def test_what_is_compressed_otherwise_is_told_how_to_unpack(tmp_path):
+    file = write_mcap(tmp_path, "none")
+    (tmp_path / "t.mcap.gz").write_bytes(gzip.compress(file.read_bytes()))
+    (tmp_path / "t.mcap.zstd").write_bytes(zstandard.compress(b"no recording"))
+    for name, words in (("t.mcap.gz", "gzip -d"), ("t.mcap.zstd", "not an MCAP file")):
+        result = through("info", tmp_path / name, None)
+        assert result.exit_code == 1 and words in result.output
+        assert f"{tmp_path / name}:" in result.output    # and not the unpacked copy
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path):
+    bag = write(tmp_path / "bag", 30)
+    (bag / "metadata.yaml").unlink()
+    before, _ = rows_of(bag)
+    for name in ("metadata.yaml", "bag_1.mcap"):
+        os.mkfifo(bag / name)
+        assert rows_of(bag)[0] == before
+    (tmp_path / "loop.mcap").symlink_to(tmp_path / "loop.mcap")
+    for path in (bag / "bag_1.mcap", Path("/dev/null"), tmp_path / "loop.mcap"):
+        for door in DOORS:
+            assert through(door, path, tmp_path / "out").exit_code == 1
+    assert not (tmp_path / "out").exists()
+
+
+# Definitions that contradict each other.
+
+@pytest.mark.parametrize("again", [
+    (4, struct.pack("<HH", 1, 1) + text("/other", "cdr", "")), schema(MAG.msgtype)])
+def test_a_number_that_is_used_again_is_no_sample_of_the_first(tmp_path, again):
+    """In a chunk and outside of them, with a summary that knows the last one only, and without."""
+    head, one, two = (schema(IMU.msgtype), channel("/imu")), message(imu(0)), message(
+        imu(1), log_time=START + STEP)
+    for file in (mcap(tmp_path / "a.mcap", *head, one, again, two),
+                 mcap(tmp_path / "b.mcap", in_chunk(*head, one), in_chunk(again, two))):
+        rows, reader = rows_of(file)
+        assert [row[3] for row in rows if row[0] == "/imu"] == [imu(0)]
+        assert reader.damaged and "is defined anew" in " ".join(reader.warnings)
+
+
+def test_a_topic_whose_type_is_not_in_the_file_is_said_to_be_lost(tmp_path):
+    file = mcap(tmp_path / "t.mcap", schema(IMU.msgtype), channel("/imu"), message(imu(0)),
+                (4, struct.pack("<HH", 2, 99) + text("/mag", "cdr", "")), message(b"", 2))
+    result = through("info", file, None)
+    assert result.exit_code == INCOMPLETE
+    assert "the type of topic /mag (schema 99) is not in the file; 1 messages" in result.output
+
+
+def test_a_hole_in_a_chunk_without_checksum_is_stepped_over_and_told(tmp_path):
+    """As rosbag2's preset fastwrite leaves it."""
+    opcode, content = in_chunk(schema(IMU.msgtype), channel("/imu"), *(
+        message(imu(i), log_time=START + i * STEP) for i in range(20)))
+    content = bytearray(content)
+    at = len(content) // 2
+    content[at:at + 600] = bytes(600)
+    rows, reader = rows_of(mcap(tmp_path / "t.mcap", (opcode, bytes(content))))
+    found = [row[2] for row in rows]
+    assert 15 <= len(rows) < 20 and {START, START + 19 * STEP} <= set(found)
+    assert reader.damaged and "in a chunk at byte" in " ".join(reader.warnings)
+
+
+# Databases.
+
+def test_a_database_that_was_cut_off_is_read_up_to_the_cut(tmp_path):
+    file = write_db3(tmp_path)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    before, _ = rows_of(file)
+    data = file.read_bytes()
+    file.write_bytes(data[:len(data) // 2])
+    after, reader = rows_of(file)
+    assert reader.damaged and set(after) < set(before) and len(after) > 0.3 * len(before)
+
+
+def test_a_log_of_a_killed_recorder_is_used_and_nothing_is_written_beside(tmp_path):
+    source = sqlite3.connect(write_db3(tmp_path))
+    (tmp_path / "x").mkdir()
+    database = sqlite3.connect(tmp_path / "x" / "x.db3", isolation_level=None)
+    database.execute("pragma journal_mode = wal")
+    database.execute("pragma wal_autocheckpoint = 0")
+    for statement in source.iterdump():
+        if statement.startswith(("BEGIN", "CREATE", "INSERT", "COMMIT")):
+            database.execute(statement)
+    for name in ("x.db3", "x.db3-wal"):
+        (tmp_path / name).write_bytes((tmp_path / "x" / name).read_bytes())
+    assert rows_of(tmp_path / "x.db3")[0] == rows_of(tmp_path / "bag")[0]
+    for left in tmp_path.glob("x.db3-*"):
+        left.unlink()
+    result = through("info", tmp_path / "x.db3", None)
+    assert result.exit_code == 1 and "x.db3-wal" in result.output
+    assert not list(tmp_path.glob("x.db3-*"))
+    database.close()
+
+
+def test_what_a_database_only_claims_is_neither_waited_for_nor_passed_over(tmp_path):
+    file = write_db3(tmp_path)
+    with sqlite3.connect(file) as database:
+        database.execute("update messages set topic_id = 77 where id % 3 = 0")
+        database.execute("update messages set data = 'text' where id = 10")
+    result = through("info", file, None)
+    assert result.exit_code == INCOMPLETE
+    assert "160 messages are of a topic (77)" in result.output and "no bytes" in result.output
+    with sqlite3.connect(file) as database:
+        database.execute("alter table messages rename to others")
+        database.execute("create view messages as with recursive c(x) as (select 1 union all "
+                         "select x + 1 from c) select x as id, 1 as topic_id, x as timestamp, "
+                         "x'00' as data from c")
+    result = through("info", file, None)
+    assert result.exit_code == 1 and "no tables" in result.output
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))

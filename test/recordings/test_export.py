@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from imu_fusion import cli
 from imu_fusion.errors import BagError
 from imu_fusion.messages.convert import fix_message, imu_message, pose_message
-from imu_fusion.messages.layouts import ACCEL, ODOMETRY
+from imu_fusion.messages.layouts import ACCEL, ODOMETRY, TWIST
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.export import export
@@ -35,6 +35,9 @@ def bag(tmp_path):
                 stamp, "world", np.arange(ODOMETRY.size, dtype=float), "body"), stamp)
             writer.write("/acceleration_field/accel", ACCEL.msgtype, ACCEL.encode(
                 stamp, "body", np.r_[1.0:7.0, np.diag(np.arange(6.0) ** 2).ravel()]), stamp)
+            writer.write("/imu/gyro_bias", TWIST.msgtype, TWIST.encode(
+                stamp, "imu_link", np.r_[0.0, 0.0, 0.0, 0.01, 0.02, 0.03,
+                                         np.diag([0, 0, 0, 1e-6, 4e-6, 9e-6]).ravel()]), stamp)
             writer.write("/text", "std_msgs/msg/String", b"\0\1\0\0\2\0\0\0a\0", stamp)
     return tmp_path / "bag"
 
@@ -56,6 +59,9 @@ def test_rows_are_the_messages_and_the_header_names_units(bag, tmp_path):
     assert rows[2]["specific_force_z [m/s^2]"] == ""    # absent
     fixes = table(tmp_path / "out" / "fix.csv")
     assert fixes[0]["height [m]"] == "400.5" and fixes[0]["sd_up [m]"] == ""    # unknown
+    bias = table(tmp_path / "out" / "imu_gyro_bias.csv")
+    assert [float(bias[0][name]) for name in ("gyro_bias_y [rad/s]", "sd_gyro_bias_z [rad/s]")] == (
+        pytest.approx([0.02, 0.003]))
     odometry = table(tmp_path / "out" / "smoother_odometry.csv")
     assert float(odometry[0]["position_z [m]"]) == 2.0
     assert float(odometry[0]["sd_position_y [m]"]) == pytest.approx(np.sqrt(7.0 + 7.0))

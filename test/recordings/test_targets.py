@@ -49,7 +49,9 @@ def test_repair_and_report_do_not_write_over_their_source(tmp_path):
     bag = write(tmp_path / "bag", 20)
     before = contents(tmp_path)
     for arguments in (["info", str(bag), "--repair", str(bag)],
-                      ["report", str(bag), "--out", str(bag / "bag_0.mcap")]):
+                      ["report", str(bag), "--out", str(bag / "bag_0.mcap")],
+                      ["calibrate", "noise", str(bag), "--out", str(bag / "bag_0.mcap")],
+                      ["calibrate", "noise", str(bag), "--plot", str(bag / "metadata.yaml")]):
         result = CliRunner().invoke(cli, arguments)
         assert result.exit_code == 1 and "choose another name" in result.output
     assert contents(tmp_path) == before

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from imu_fusion import cli
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.messages.convert import string_value
 from imu_fusion.parameters.file import parameters_for
@@ -92,14 +90,3 @@ def test_what_is_no_ball_has_no_such_section(smoothed, logs):
     assert slope_of(still, raw) is None
     nowhere = Smoothed(smoothed.result, smoothed.params, None, None, None, smoothed.origin)
     assert slope_of(nowhere, raw) is None
-
-
-@pytest.mark.slow
-def test_the_demo_follows_the_ball_through_the_nodes(tmp_path):
-    result = CliRunner().invoke(cli.cli, ["demo", "avalanche", "--out", str(tmp_path)],
-                                catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert "bit for bit" in result.output and "SIMULATED" in result.output
-    assert "On the slope" in (tmp_path / "report.html").read_text()
-    with open_bag(tmp_path / "recording") as reader:
-        assert reader.topics["/smoother/odometry"].count == 11926

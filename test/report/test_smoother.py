@@ -22,7 +22,7 @@ from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report import smoother as report
 from imu_fusion.report.contents import make_estimates, smoothed_of
-from imu_fusion.report.html import Figure, Table, render_report, scripts
+from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.smoother import Smoothed, interpolate, smoother_sections
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
@@ -192,15 +192,3 @@ def test_a_real_browser_draws_every_figure_of_a_jump_offline(tmp_path):
     assert drawn.count('class="cartesianlayer"') == len(figures)
     assert len(re.findall(r"<canvas", drawn)) == 1
     assert not re.search(r'<div class="[^"]*no-webgl', drawn)
-
-
-@pytest.mark.slow
-def test_the_demo_of_a_jump_finds_its_length_through_the_nodes(tmp_path):
-    result = CliRunner().invoke(cli.cli, ["demo", "jump", "--out", str(tmp_path)],
-                                catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert "bit for bit" in result.output and "SIMULATED" in result.output
-    (error,) = re.findall(r"jump length.*?([+-]\d+\.\d+) *│\n", result.output)
-    assert abs(float(error)) < 0.4  # four sigma of the stated 0.1 m
-    page = (tmp_path / "report.html").read_text()
-    assert scripts() in page and len(page) > len(scripts()) + 2e5    # whole, and with its data

@@ -41,6 +41,7 @@ def test_a_connection_on_which_nothing_comes_is_made_anew(listener):
     until(lambda: "silent for 0.2 s" in made.problem)
     accepted.append(listener.accept()[0])
     until(lambda: made.connections == 2)
+    assert "silent" in made.problem    # that it can be opened is no news
     accepted[1].sendall(b"a")
     chunks = []
     until(lambda: chunks.extend(made.take()) or chunks)

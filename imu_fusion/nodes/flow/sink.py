@@ -185,8 +185,9 @@ class Sink:
         return [s for s in self.sessions.values() if s.topics and not s.finished]
 
     def company(self) -> set[str]:
-        """The instances that the senders of these sessions know."""
-        return {i for s in self.feeding() for i in s.said.company} - {self.peers.own}
+        """The instances that the senders of these sessions know, as long as they are there."""
+        return {i for s in self.feeding() if not s.broken
+                for i in s.said.company} - {self.peers.own}
 
     def joined(self) -> Mapping[str, Joined]:
         """What is said of the sessions.

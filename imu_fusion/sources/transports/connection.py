@@ -34,8 +34,9 @@ class Connection:
         longest_pause: s between two attempts at most.
         retries: whether a lost device is waited for.
 
-    ``problem`` says what is wrong now, empty if nothing is; ``connections`` how often it was
-    opened; ``ended`` that there will be no more.
+    ``problem`` says what is wrong now, empty if nothing is: one that a device has which can be
+    opened stands until bytes come. ``connections``: how often it was opened; ``ended``: there will
+    be no more.
     """
 
     def __init__(self, transport: Transport, wake: Callable[[], object], silence: float | None,
@@ -45,6 +46,7 @@ class Connection:
         self._silence = None if transport.is_open_ended else silence
         self._longest_pause, self._retries = longest_pause, retries
         self._failures = 0    # since bytes came
+        self._opens_in_vain = False
         self._chunks: deque[Chunk] = deque()
         self._size = 0
         self._lock = threading.Condition()
@@ -71,13 +73,16 @@ class Connection:
             self._lock.notify()
         if self._thread.is_alive():
             self._thread.join(2.0)    # a name server may keep it longer
+        self._wake = lambda: None     # whom it would wake may be gone then
 
     def _run(self) -> None:
         while not self._stopping.is_set():
             try:
                 self._transport.open()
                 self.connections += 1
-                self._say("")
+                if not self._opens_in_vain:
+                    self._say("")
+                self._opens_in_vain = True
                 self._listen()
             except DeviceError as error:
                 self._say(str(error))
@@ -97,7 +102,8 @@ class Connection:
             parts = self._transport.read(_WAIT)
             arrival = time.time_ns()
             if parts:
-                heard, self._failures = time.monotonic(), 0
+                heard, self._failures, self._opens_in_vain = time.monotonic(), 0, False
+                self._say("")
             elif self._silence is not None and time.monotonic() - heard > self._silence:
                 raise DeviceError(f"{self._transport.address}: silent for {self._silence:g} s")
             for part, data in parts:
