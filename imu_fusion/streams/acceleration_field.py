@@ -327,4 +327,4 @@ def _configure(stage, params_file):
 
 # Its topics are those of the accelerometers that a parameter file describes.
 STAGE = Stage(NODE, (FieldConfiguration,), (EstimatorNodeParams,), {}, (), OUTPUTS,
-              AccelerationFieldStream, lambda logs: [], _configure)
+              AccelerationFieldStream, configure=_configure)

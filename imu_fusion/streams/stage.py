@@ -25,6 +25,10 @@ def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
     return found
 
 
+def _no_findings(logs: Mapping) -> list[Finding]:
+    return []
+
+
 @dataclass(frozen=True, eq=False)
 class Stage:
     """One estimator, between its topics.
@@ -38,7 +42,8 @@ class Stage:
         outputs: topic to message type.
         stream: the class of its Stream, ``(*params, warn=...)``.
         findings: ``(logs)`` lists what looks wrong with whole logs as recorded.
-        configure: ``(stage, params_file)`` is (Stage, parameters): topics may depend on these.
+        configure: ``(stage, params_file)`` is (Stage, parameters), where reading the parameters is
+            not all: topics may depend on them.
         unusable: why it cannot run, empty if it can.
     """
 
@@ -49,8 +54,8 @@ class Stage:
     required: tuple[str, ...]
     outputs: Mapping[str, str]
     stream: type[Any]
-    findings: Callable[[Mapping], Sequence[Finding]]
-    configure: Callable[["Stage", ParamsFile], tuple["Stage", list]]
+    findings: Callable[[Mapping], Sequence[Finding]] = _no_findings
+    configure: Callable[["Stage", ParamsFile], tuple["Stage", list]] | None = None
     unusable: str = ""
 
     def prepare(self, params_file: ParamsFile = None) -> tuple["Stage", list]:
@@ -59,7 +64,9 @@ class Stage:
         Raises:
             ImuFusionError: the parameters, or files that they name, are not usable.
         """
-        return self.configure(self, params_file)
+        if self.configure is not None:
+            return self.configure(self, params_file)
+        return self, self.read_params(params_file)
 
     def has_clock(self, topic: str) -> bool:
         """Whether the clock of a topic is judged: see Guard."""
