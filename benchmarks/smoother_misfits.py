@@ -7,6 +7,7 @@ repeated with other noise; the drive is real, and its truth the RTK fixes that w
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -157,12 +158,22 @@ def withheld(row):
     row.add(error, cov, result.remarks())
 
 
-def jumps(row):
-    """Lengths of 11 to 126 m, soft and hard landings; the error is that of the length."""
-    hill = load_surface("oberstdorf_hs106")
-    for start in (-30.0, -40.0, -50.0, -60.0, -70.0, -78.0, -90.0):
-        for own in ({}, {"sink_time": 0.12, "braking": 3.5}, {"sink_time": 0.03, "braking": 3.5}):
-            jump = SkiJump(hill, JumpParams(start_x=start, duration=30.0, **own))
+class Fall(SkiJump):
+    """Beginning 0.2 s after touch-down, the sensor comes down by 0.8 m within 0.5 s, for good."""
+
+    def _sink(self, t):
+        s = np.clip((t - self.t_touchdown - 0.2) / 0.5, 0.0, 1.0)
+        return super()._sink(t) - 0.8 * np.stack([
+            s ** 3 * (10 - 15 * s + 6 * s * s), 30 * (s * (1 - s)) ** 2 / 0.5,
+            60 * s * (1 - s) * (1 - 2 * s) / 0.25])
+
+
+def jumps(kind: type[SkiJump], *landings: dict) -> Callable:
+    """Lengths of 11 to 126 m; the error is that of the length."""
+    def run(row):
+        hill = load_surface("oberstdorf_hs106")
+        for start, own in product((-30.0, -40.0, -50.0, -60.0, -70.0, -78.0, -90.0), landings):
+            jump = kind(hill, JumpParams(start_x=start, duration=30.0, **own))
             for seed in range(3):
                 recording = record(jump.shaken(np.random.default_rng([seed, 1])),
                                    np.random.default_rng(seed))
@@ -174,6 +185,7 @@ def jumps(row):
                     continue
                 row.add(np.array([[result.jump.length - jump.length]]),
                         np.array([[[result.jump.length_sd ** 2]]]), result.remarks())
+    return run
 
 
 SITUATIONS = (
@@ -190,7 +202,10 @@ SITUATIONS = (
     ("a sixth of the fixes 75 m beside the path", "misfit 1.02, nothing said", eights(canyon)),
     ("noise of the Imu six times as stated", "", eights(shaken)),
     ("jumps of 11 to 126 m, soft and hard landings: length", "11 of 80 73-144 m too long, sd 1.9",
-     jumps),
+     jumps(SkiJump, {}, {"sink_time": 0.03, "braking": 3.5})),
+    ("the same, deep landings (sinking by up to 1.2 m)", "",
+     jumps(SkiJump, {"sink_time": 0.12, "braking": 3.5})),
+    ("the same, falls by 0.8 m", "", jumps(Fall, {}, {"sink_time": 0.12, "braking": 3.5})),
     ("real drive, defaults: 11 x 15 s without fixes", "NEES 16-25 (a walk)", withheld),
     ("real drive, wandering receiver, 4 Hz", "", car(1, True)),
     ("real drive, wandering receiver, 1 Hz", "7.7 m off, stated 1.9", car(4, True)),

@@ -208,7 +208,7 @@ class SmootherNode(EstimatorNode):
             self.get_logger().info(result)
             return
         _, outcome = self._result = result
-        message = "; ".join([outcome.summary, *outcome.remarks])
+        message = "; ".join([outcome.summary, *outcome.remarks, *self._left_out()])
         self.get_logger().info(message)
         self._answer.set_result((True, message))
 
@@ -246,11 +246,17 @@ class SmootherNode(EstimatorNode):
         self._stream.reset()
         return "the collection is empty"
 
+    def _left_out(self):
+        """Texts on the samples of the collection that were not used."""
+        return [f"{topic}: {count} samples left out: {why}" for topic in self._stream.inputs
+                for why, count in self._stream.refused(topic).items()]
+
     def _status(self):
         stream = self._stream
         values: dict[str, float] = {f"{topic} collected": n for topic, n in stream.counts().items()}
-        values |= {f"{topic} {why}": n for topic in stream.inputs
-                   for why, n in stream.refused(topic).items()}
+        left_out = {f"{topic} {why}": n for topic in stream.inputs
+                    for why, n in stream.refused(topic).items()}
+        values |= left_out
         values |= {"megabytes": round(stream.bytes / 1e6, 1), "dropped": stream.dropped}
         if stream.dropped:
             return DiagnosticStatus.ERROR, "memory_limit reached, samples are dropped", values
@@ -258,4 +264,6 @@ class SmootherNode(EstimatorNode):
             return DiagnosticStatus.OK, "smoothing", values
         if self._result is not None or self._messages is not None:
             return DiagnosticStatus.OK, "publishing", values
+        if left_out:
+            return DiagnosticStatus.WARN, "collecting; samples were left out", values
         return DiagnosticStatus.OK, "collecting", values

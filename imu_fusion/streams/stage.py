@@ -21,6 +21,7 @@ def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
         found += checks.check_fix(logs[FIX_TOPIC])
     if MAG_TOPIC in logs:
         found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
+        found += checks.check_clock(logs[MAG_TOPIC].stamp, logs[IMU_TOPIC].stamp, MAG_TOPIC)
         found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
     return found
 

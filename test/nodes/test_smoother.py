@@ -32,11 +32,11 @@ TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix":
           "/smoother/results": DiagnosticArray}
 
 
-def write(path, count=600, without_fixes=range(0), set_back=None):
+def write(path, count=600, without_fixes=range(0), broken=(), set_back=None):
     """Standing still at Innsbruck for two seconds, then off to the east at 1 m/s^2.
 
-    without_fixes: numbers of Imu samples beside which there is no fix. set_back: that from which on
-    the clock is behind by an hour.
+    without_fixes: numbers of Imu samples beside which there is no fix. broken: of those whose
+    message has 60 bytes. set_back: that from which on the clock is behind by an hour.
     """
     rng = np.random.default_rng(5)
     with BagWriter(path) as writer:
@@ -46,8 +46,8 @@ def write(path, count=600, without_fixes=range(0), set_back=None):
             t = max(0.0, (i - 200) * STEP * 1e-9)
             noise = rng.normal(0, 0.01, 3)
             force = [1.0 if t else 0.0, 0.0, 9.805]
-            writer.write("/imu/data_raw", IMU.msgtype,
-                         imu_message(stamp, "car", 0.001 * noise, force + noise), at)
+            cdr = imu_message(stamp, "car", 0.001 * noise, force + noise)
+            writer.write("/imu/data_raw", IMU.msgtype, cdr[:60] if i in broken else cdr, at)
             if i % 10 == 0 and i not in without_fixes:
                 east = 0.5 * t * t
                 writer.write("/fix", FIX.msgtype, fix_message(
@@ -176,7 +176,7 @@ def test_without_samples_the_answer_is_no_with_the_reason(graph):
 
 
 def test_a_second_call_is_refused_and_clear_empties(graph, tmp_path):
-    bag = write(tmp_path / "bag")
+    bag = write(tmp_path / "bag", broken=[300])
     smoother = graph.start(SmootherNode, qos="reliable")
     replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
     graph.until(lambda: replayer.finished)
@@ -188,7 +188,9 @@ def test_a_second_call_is_refused_and_clear_empties(graph, tmp_path):
     assert not second.result().success and "already running" in second.result().message
     graph.until(first.done, 120.0)
     assert first.result().success
-    assert smoother._stream.counts()["imu/data_raw"] == 600
+    left_out = "imu/data_raw: 1 samples left out: cannot be decoded"    # as of every door
+    assert left_out in first.result().message and left_out in smoother._left_out()
+    assert smoother._stream.counts()["imu/data_raw"] == 599
     assert graph.call(node, Trigger, "/smoother/clear").success
     assert smoother._stream.counts()["imu/data_raw"] == 0
 

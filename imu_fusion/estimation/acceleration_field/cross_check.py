@@ -42,6 +42,8 @@ _MOST = 50.0        # beyond which evidence does not grow
 _SCALE = 1e-3       # of what it feels: no accelerometer is truer
 _SHARE = 1e-3       # of a channel's reading that must be left over for a check of it
 _FAR_BETTER = 10.0  # times smaller variances of a and alpha
+_EXCITING = 20.0    # times the noise: what turning must make of readings to tell of the mounting
+_LEFT = 0.2         # of the sds of a mounting, to which linearised rows may find it
 _FORGET = 0.1       # of a sample's evidence, by one in which a moving sensor agrees
 
 
@@ -71,6 +73,10 @@ class Workspace(NamedTuple):
     left: np.ndarray       # (m,) what the fit leaves over
     use: np.ndarray        # (m,) bool, the answer
     doubt: np.ndarray      # (m,) variance to add to that of the noise
+    is_settled: np.ndarray   # (1,) bool, whether the angular velocity was hardly known before, and
+    #                          what it is linearised at has been found: see hardly_known_rate
+    is_open: np.ndarray      # (1,) bool, whether its sign is open
+    vague: np.ndarray        # (3, 3) covariance about it
 
 
 def make_workspace(channels: np.ndarray) -> Workspace:
@@ -87,7 +93,7 @@ def make_workspace(channels: np.ndarray) -> Workspace:
     return Workspace(
         np.zeros((m, TOUCHED), np.int64), np.zeros((m, TOUCHED)), np.zeros(m, np.int64),
         np.zeros(m), np.zeros((3, 3)), design, fit(), fit(), np.zeros(m), np.ones(m), np.zeros(m),
-        np.zeros(m, bool), np.zeros(m))
+        np.zeros(m, bool), np.zeros(m), np.zeros(1, bool), np.zeros(1, bool), np.zeros((3, 3)))
 
 
 @njit
@@ -159,8 +165,11 @@ def cross_check(state, p, channels, reading, at, work):
             work.innovation[c] = innovation_of(
                 reading[c], work.expected[c], work.entries[c], work.touched[c], work.row[c],
                 state.x, at)
+            if work.is_settled[0]:    # there it is known
+                for i in range(3):
+                    work.innovation[c] += work.row[c, i] * (state.x[OMEGA + i] - at[OMEGA + i])
     if work.fit.redundancy[0] >= 0:
-        _allow(state, p, channels, reading, work)
+        _allow(state, p, channels, reading, at, work)
     if work.fit.redundancy[0] > 0:
         worst = _worst(work.fit, work)
         while worst > _GATE * _GATE and _leave_out(state, channels, work, worst, p):
@@ -172,6 +181,12 @@ def cross_check(state, p, channels, reading, at, work):
         work.doubt[c] = doubt * work.variance[c]
         work.use[c] = math.isfinite(reading[c]) and (channels[c].is_gyro or work.fit.used[c]
                                                      or work.fit.redundancy[0] < 0)
+
+
+@njit
+def rate_covariance(state, work):
+    """Covariance (3, 3) of the angular velocity about where it is linearised."""
+    return work.vague if work.is_settled[0] else state.cov[OMEGA:ALPHA, OMEGA:ALPHA]
 
 
 @njit
@@ -195,9 +210,8 @@ def linearise_well(state, p, channels, at, work):
     two errors, which no linearisation sees: of the mounting and of what it multiplies, and of the
     angular velocity with itself."""
     cov, fit = state.cov, work.fit
-    spin, force, turning = 0.0, 0.0, 0.0
+    spin, force, turning = np.trace(rate_covariance(state, work)), 0.0, 0.0
     for i in range(3):
-        spin += cov[OMEGA + i, OMEGA + i]
         force += cov[ACC + i, ACC + i]
         turning += cov[ALPHA + i, ALPHA + i]
     if fit.redundancy[0] >= 0:
@@ -232,16 +246,39 @@ def linearise_well(state, p, channels, at, work):
 
 
 @njit
-def _allow(state, p, channels, reading, work):
+def learns_mounting(state, p, channels, at, work):
+    """Whether a sample tells of the mounting: where a body hardly turns, the rows of its states
+    change with the noise of the state that they are linearised at, and would seem to. Beyond a
+    share of what was known of it, errors of the linearisation would, too."""
+    if work.is_settled[0]:
+        return False
+    omega, alpha = at[OMEGA:ALPHA], at[ALPHA:ALPHA + 3]
+    speed = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
+    turning = alpha[0] * alpha[0] + alpha[1] * alpha[1] + alpha[2] * alpha[2]
+    noise, left, first = 0.0, 0.0, 0.0
+    for c in range(len(channels)):
+        channel = channels[c]
+        noise = max(noise, noise_variance(channel, p))
+        for i in range(3):
+            if channel.turn >= 0:
+                left += state.cov[channel.turn + i, channel.turn + i] / channel.axes_sd ** 2
+                first += 1.0
+            if channel.shift >= 0:
+                left += state.cov[channel.shift + i, channel.shift + i] / channel.position_sd ** 2
+                first += 1.0
+    return (p.radius * p.radius * (turning + speed * speed) > _EXCITING * _EXCITING * noise
+            and left > _LEFT * _LEFT * first)
+
+
+@njit
+def _allow(state, p, channels, reading, at, work):
     """The variances of the innovations that noise, bias, mounting and angular velocity allow.
 
     Those of mounting are of what is felt now: predictions come late when an impact begins.
     """
     squares, count = 0.0, 0
-    # Where the rate is unknown its square is, too.
-    spin = 0.0
-    for i in range(3):
-        spin += state.cov[OMEGA + i, OMEGA + i]
+    cov = rate_covariance(state, work)
+    spin = np.trace(cov)    # where the rate is unknown its square is, too
     for c in range(len(channels)):
         channel = channels[c]
         if channel.is_gyro or not math.isfinite(reading[c]):
@@ -251,12 +288,12 @@ def _allow(state, p, channels, reading, work):
         turned = spin * spin * (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
         for i in range(3):
             for j in range(3):
-                turned += h[i] * state.cov[OMEGA + i, OMEGA + j] * h[j]
+                turned += h[i] * cov[i, j] * h[j]
         work.variance[c] = (noise_variance(channel, p) + channel.bias_sd * channel.bias_sd
                             + turned)
         squares += reading[c] * reading[c]
         count += 1
-    omega = state.x[OMEGA:ALPHA]
+    omega = at[OMEGA:ALPHA]
     speed = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
     turning = speed * speed
     for i in range(3):

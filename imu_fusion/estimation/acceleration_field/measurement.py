@@ -25,19 +25,23 @@ from imu_fusion.kernels import njit
 
 # States that one channel touches: omega, alpha, a, its own bias, and its sensor's mounting.
 TOUCHED = 16
+#: Updates of the angular velocity that may precede those of the channels: see
+#: :mod:`.hardly_known_rate`.
+RATE_ROWS = 3
 
 
 class Trace(NamedTuple):
-    """What the smoother needs of a stretch of n samples of N states."""
+    """What the smoother needs of a stretch of n samples of N states. The RATE_ROWS follow the m
+    channels, but come before them in time."""
 
     x: np.ndarray            # (n, N) mean after the sample
     cov: np.ndarray          # (n, N, N) after the sample
     phi: np.ndarray          # (n, 3) rotation of the step to it, rad
     dt: np.ndarray           # (n,) s, that step; negative across a gap, 0 for the first sample
-    column: np.ndarray       # (n, m, N) covariance of the state with the channel's innovation
-    total: np.ndarray        # (n, m) variance of the innovation; 0 marks an unused channel
-    innovation: np.ndarray   # (n, m)
-    row: np.ndarray          # (n, m, TOUCHED) of the measurement matrix
+    column: np.ndarray       # (n, m + 3, N) covariance of the state with the channel's innovation
+    total: np.ndarray        # (n, m + 3) variance of the innovation; 0 marks an unused channel
+    innovation: np.ndarray   # (n, m + 3)
+    row: np.ndarray          # (n, m + 3, TOUCHED) of the measurement matrix
 
 
 class Innovations(NamedTuple):
@@ -51,10 +55,10 @@ class Innovations(NamedTuple):
 
 def make_trace(samples: int, channels: int, size: int) -> Trace:
     """An empty :class:`Trace` of a state of ``size`` N."""
-    n = samples
+    n, updates = samples, channels + RATE_ROWS
     return Trace(np.zeros((n, size)), np.zeros((n, size, size)), np.zeros((n, 3)), np.zeros(n),
-                 np.zeros((n, channels, size)), np.zeros((n, channels)),
-                 np.zeros((n, channels)), np.zeros((n, channels, TOUCHED)))
+                 np.zeros((n, updates, size)), np.zeros((n, updates)),
+                 np.zeros((n, updates)), np.zeros((n, updates, TOUCHED)))
 
 
 @njit
@@ -71,7 +75,7 @@ def channel_row(channel, c, at, index, h, scratch):
     scratch: (3, 3), to work in. Returns (number of entries, reading expected at ``at``).
     """
     u, r, moment = scratch[0], scratch[1], scratch[2]
-    count = _mounted(channel, at, u, r)
+    count = mounted(channel, at, u, r)
     omega = at[OMEGA:ALPHA]
     uw = u[0] * omega[0] + u[1] * omega[1] + u[2] * omega[2]
     if channel.is_gyro:
@@ -111,7 +115,7 @@ def channel_row(channel, c, at, index, h, scratch):
 
 
 @njit
-def _mounted(channel, at, u, r):
+def mounted(channel, at, u, r):
     """Direction u (3,) and lever r (3,) of a channel as mounted, by the state ``at``, in place.
     Returns how many entries the row of an accelerometer has."""
     count = 10
@@ -148,10 +152,11 @@ def _put_turn(channel, at, moment, index, h, first):
 
 
 @njit
-def scalar_update(x, cov, index, h, count, innovation, variance, column):
+def scalar_update(x, cov, index, h, count, innovation, variance, column, open_states):
     """Kalman update by one scalar with a sparse row, in place; ``column`` receives P H'.
 
-    Returns the innovation variance.
+    Only the first ``open_states`` learn from it; what is stated of them includes the others'
+    errors (Schmidt 1966). Returns the innovation variance.
     """
     n = len(x)
     column[:] = 0.0
@@ -165,8 +170,12 @@ def scalar_update(x, cov, index, h, count, innovation, variance, column):
     inverse = 1.0 / total
     for i in range(n):
         moved, row = column[i], cov[i]
-        x[i] += moved * inverse * innovation
-        for j in range(n):    # in this order it stays symmetric to the last bit
+        last = n
+        if i < open_states:
+            x[i] += moved * inverse * innovation
+        else:
+            last = open_states
+        for j in range(last):    # in this order it stays symmetric to the last bit
             row[j] -= moved * column[j] * inverse
     return total
 
@@ -174,10 +183,16 @@ def scalar_update(x, cov, index, h, count, innovation, variance, column):
 @njit
 def linearise(channels, at, work):
     """Put the rows of all channels, linearised at a state ``at`` (N,), and what they expect there
-    into the Workspace."""
+    into the Workspace; with the mean of the squares of an angular velocity that is vague."""
     for c in range(len(channels)):
         work.entries[c], work.expected[c] = channel_row(channels[c], c, at, work.touched[c],
                                                       work.row[c], work.scratch)
+        if work.is_settled[0] and not channels[c].is_gyro:
+            u, r, vague = work.scratch[0], work.scratch[1], work.vague
+            spin = vague[0, 0] + vague[1, 1] + vague[2, 2]
+            for i in range(3):
+                work.expected[c] += u[i] * (vague[i, 0] * r[0] + vague[i, 1] * r[1]
+                                            + vague[i, 2] * r[2] - spin * r[i])
 
 
 @njit
@@ -192,7 +207,7 @@ def innovation_of(reading, expected, count, index, row, x, at):
 
 
 @njit
-def update(state, p, channels, reading, at, work, trace, n):
+def update(state, p, channels, reading, at, work, trace, n, open_states):
     """Correct the State by the channels in use of one sample, in place.
 
     Args:
@@ -201,6 +216,7 @@ def update(state, p, channels, reading, at, work, trace, n):
         work: Workspace, whose ``use`` says which channels are in use, and ``doubt`` what is added
             to the variance of their noise.
         trace: Trace that gets sample n.
+        open_states: how many states learn, see :func:`scalar_update`.
 
     Returns :class:`Innovations`.
     """
@@ -215,7 +231,7 @@ def update(state, p, channels, reading, at, work, trace, n):
         innovation = innovation_of(reading[c], work.expected[c], count, index, row, state.x, at)
         total = scalar_update(state.x, state.cov, index, row, count, innovation,
                               noisiness * noise_variance(channels[c], p) + work.doubt[c],
-                              trace.column[n, c])
+                              trace.column[n, c], open_states)
         trace.total[n, c] = total
         trace.innovation[n, c] = innovation
         trace.row[n, c] = row

@@ -30,13 +30,14 @@ _VALUE, _RATE, _VV, _RR, _VR = range(5)
 
 
 @njit
-def watch_motion(state, p, channels, reading, step, work):
+def watch_motion(state, p, channels, reading, at, step, work):
     """Follow the fit of a sample, and widen the covariance of the predicted State by what the
     motion is found to be wilder.
 
     Args:
         state: State, predicted to the sample.
-        p: record of the parameters, channels: (m,) CHANNEL, reading: (m,).
+        p: record of the parameters, channels: (m,) CHANNEL, reading: (m,),
+            at: (N,) where they are linearised.
         step: the Step to this sample, of no length at the first one and after gaps.
         work: Workspace, after the cross-check.
     """
@@ -45,7 +46,7 @@ def watch_motion(state, p, channels, reading, step, work):
         state.fitted[:] = False
         return
     values, variances = np.zeros(6), np.zeros(6)
-    _fit_readings(state, p, channels, reading, fit, values, variances)
+    _fit_readings(state, p, channels, reading, at, fit, values, variances)
     tracked = adaptation.tracked
     goes_on = step.dt[0] > 0.0
     for c in range(len(channels)):
@@ -100,10 +101,10 @@ def _judge(state, p, step, values, variances):
 
 
 @njit
-def _fit_readings(state, p, channels, reading, fit, values, variances):
+def _fit_readings(state, p, channels, reading, at, fit, values, variances):
     """The fit (6,) of a and alpha (times the radius) to the readings as they are, but for the
     centripetal part, and the variances (6,) of its noise."""
-    w = state.x[OMEGA:OMEGA + 3]
+    w = at[OMEGA:OMEGA + 3]
     noisiness = factor(state.adaptation[0].noise)
     for c in range(len(channels)):
         if not fit.used[c]:

@@ -4,16 +4,28 @@ import math
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.adaptation import ADAPTATION, GRACE, adapt
+from imu_fusion.estimation.acceleration_field.adaptation import (
+    ADAPTATION,
+    GRACE,
+    adapt,
+)
 from imu_fusion.estimation.acceleration_field.cross_check import (
     CHECK,
     contradiction,
     cross_check,
+    learns_mounting,
     linearise_well,
     make_workspace,
 )
+from imu_fusion.estimation.acceleration_field.hardly_known_rate import (
+    is_hardly_known,
+    leave_rate_out,
+    settle_rate,
+)
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
+    RATE_ROWS,
+    TOUCHED,
     Trace,
     linearise,
     make_trace,
@@ -32,7 +44,7 @@ from imu_fusion.estimation.acceleration_field.motion_model import (
 )
 from imu_fusion.estimation.acceleration_field.motion_watch import watch_motion
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
-from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_row, rigid_gradient
+from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_rigid_row
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
@@ -79,16 +91,28 @@ def _fold(state):
 
 
 @njit
-def _correct(state, p, channels, reading, at, is_predicted, step, work, trace, n):
+def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, work, trace, n):
     """Correct the State by a sample, linearised at the state ``at`` (N,), which may be that
     predicted, in place; the other arguments and what is returned are those of :func:`update`."""
+    m = len(channels)
+    trace.total[n, m:] = 0.0
+    work.is_settled[0] = work.is_open[0] = False
+    if p.is_adaptive and is_predicted and is_hardly_known(state, channels, p):
+        work.is_settled[0] = settle_rate(state, p, channels, reading, at, work, trace, n)
     linearise(channels, at, work)
     cross_check(state, p, channels, reading, at, work)
     if p.is_adaptive:
-        watch_motion(state, p, channels, reading, step, work)
+        watch_motion(state, p, channels, reading, at, step, work)
     if is_predicted:
         linearise_well(state, p, channels, at, work)
-    found = update(state, p, channels, reading, at, work, trace, n)
+    if work.is_open[0]:
+        leave_rate_out(channels, work)
+    open_states = len(state.x)
+    if is_causal and not learns_mounting(state, p, channels, at, work):
+        open_states = BIAS + m
+    found = update(state, p, channels, reading, at, work, trace, n, open_states)
+    if work.is_settled[0] and is_hardly_known(state, channels, p):
+        state.adaptation[0].vague += 1
     if found.used > 0 and p.is_adaptive:
         adapt(state.adaptation[0], found.squares / found.used, contradiction(p, channels, work),
               work.fit.redundancy[0] >= 0, work.innovation, state.innovation)
@@ -109,7 +133,7 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
     for n in range(len(stamp)):
         flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
         at[:] = state.x
-        found = _correct(state, p, channels, readings[n], at, True, step, work, trace, only)
+        found = _correct(state, p, channels, readings[n], at, True, True, step, work, trace, only)
         _fold(state)
         flags |= found.flags
         residual = math.nan
@@ -122,8 +146,8 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
         row.stamp = stamp[n]
         row.flags = flags
         row.residual_rms = residual
-        put_row(row, p, state.quat, s.omega, s.alpha, s.acc,
-                np.ascontiguousarray(state.cov[:BIAS, :BIAS]), rigid_gradient(s.omega, s.alpha))
+        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc,
+                      np.ascontiguousarray(state.cov[:BIAS, :BIAS]))
 
 
 @njit
@@ -141,7 +165,7 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
         predicted = len(at) == 0
         where[:] = state.x if predicted else at[n]
-        likelihood += _correct(state, p, channels, readings[n], where, predicted, step, work,
+        likelihood += _correct(state, p, channels, readings[n], where, predicted, False, step, work,
                                trace, n).log_likelihood
         trace.x[n] = state.x
         trace.cov[n] = state.cov
@@ -186,8 +210,9 @@ class RigidBodyFilter:
 
     @property
     def touched(self) -> np.ndarray:
-        """(m, TOUCHED) int, which states the entries of the channels' rows belong to."""
-        return self._work.touched
+        """(m + RATE_ROWS, TOUCHED) int, which states the entries of a Trace's rows belong to."""
+        return np.vstack([self._work.touched, np.tile(np.arange(TOUCHED) % 3 + OMEGA,
+                                                      (RATE_ROWS, 1))])
 
     def trace(self, stamp: np.ndarray, readings: np.ndarray, at: np.ndarray,
               trace: Trace) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
+    RATE_ROWS,
     TOUCHED,
     Trace,
     channel_row,
@@ -28,8 +29,7 @@ from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBody
 from imu_fusion.estimation.acceleration_field.rows import (
     GAP,
     ROW,
-    put_row,
-    rigid_gradient,
+    put_rigid_row,
 )
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
@@ -94,7 +94,10 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
 def _before_update(adjoint, touched, trace, n):
     """Take the Adjoint from behind the updates of sample n to before them."""
     vector, information = adjoint.vector, adjoint.information
-    for c in range(len(touched) - 1, -1, -1):
+    updates = len(touched)
+    for k in range(updates):
+        # From the last channel to the first, then the rows of the rate, which came before.
+        c = (updates - RATE_ROWS - 1 - k) % updates
         total = trace.total[n, c]
         if total == 0.0:
             continue
@@ -131,8 +134,11 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, st
         readings: (n, m), NaN for missing channels.
     """
     at = np.empty((0, len(start.x)))
+    vague = 0
     for iteration in range(params.iteration.max):
         found = smooth_once(params, array, start, stamp, readings, at)
+        # Where the filter did not know the rate, iterations may settle on the wrong sign of it.
+        vague = max(vague, int(found.last.adaptation["vague"][0]))
         if iteration > 0:
             moved = parts(found.mean).omega - parts(at).omega
             if np.all(moved ** 2 <= 1e-6 * parts(np.einsum("nii->ni", found.cov)).omega):
@@ -141,6 +147,7 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, st
     rows = np.empty(len(stamp), ROW)
     _put_smoothed(kernel_params(params, array), array.channels, stamp, readings, found.used,
                   found.mean, found.cov, start.quat.copy(), rows)
+    found.last.adaptation["vague"] = vague
     return rows, found.last
 
 
@@ -170,7 +177,7 @@ def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Star
         part = Trace(*(member[:j - i] for member in trace))
         keeper.trace(stamp[i:j], readings[i:j], at[i:j], part)
         backward(adjoint, par, keeper.touched, part, mean[i:j], cov[i:j])
-        used[i:j] = part.total > 0.0
+        used[i:j] = part.total[:, :len(channels)] > 0.0
     return Smoothed(mean, cov, used, last)
 
 
@@ -196,8 +203,7 @@ def _put_smoothed(par, channels, stamp, readings, used, mean, cov, quat, rows):
                 quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
         _put_residual(row, p, channels, readings[n], used[n], mean[n])
         own = parts(mean[n])
-        put_row(row, p, quat, own.omega, own.alpha, own.acc, cov[n],
-                rigid_gradient(own.omega, own.alpha))
+        put_rigid_row(row, p, quat, own.omega, own.alpha, own.acc, cov[n])
 
 
 @njit

@@ -89,14 +89,31 @@ def put_row(row, p, quat, omega, alpha, acc, cov, gradient):
 
 
 @njit
+def put_rigid_row(row, p, quat, omega, alpha, acc, cov):
+    """:func:`put_row` of a rigid body, whose gradient follows from omega and alpha: its mean, and
+    what products of two errors of omega add to the covariance of the field at the origin."""
+    known = cov[OMEGA:ALPHA, OMEGA:ALPHA]
+    spin = known[0, 0] + known[1, 1] + known[2, 2]
+    gradient = rigid_gradient(omega, alpha) + known
+    lever = 0.0
+    for i in range(3):
+        gradient[i, i] -= spin
+        lever += p.reference[i] * p.reference[i]
+    put_row(row, p, quat, omega, alpha, acc, cov, gradient)
+    for i in range(3):
+        row.cov_specific_force[i, i] += 0.5 * lever * spin * spin
+        row.cov_acceleration_world[i, i] += 0.5 * lever * spin * spin
+
+
+@njit
 def put_still_rows(par, stamp, quat, omega, alpha, acc, cov, rows):
     """One of ``rows`` (n,) ROW for each stamp (n,) at which the state was the same; the other
-    arguments are those of :func:`put_row`."""
+    arguments are those of :func:`put_rigid_row`."""
     for n in range(len(stamp)):
         rows[n].stamp = stamp[n]
         rows[n].flags = 0
         rows[n].residual_rms = np.nan
-        put_row(rows[n], par[0], quat, omega, alpha, acc, cov, rigid_gradient(omega, alpha))
+        put_rigid_row(rows[n], par[0], quat, omega, alpha, acc, cov)
 
 
 @njit

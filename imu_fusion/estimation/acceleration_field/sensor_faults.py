@@ -14,6 +14,7 @@ _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave o
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
 _WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
+_VAGUE = 0.1        # of the samples, in which the angular velocity may be hardly known
 _MOSTLY = 0.5       # of the samples: an impact is wilder than what is before and after it
 
 
@@ -91,6 +92,13 @@ def fit_remarks(fits: list[SensorFit], state: State) -> list[str]:
             f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
             f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
             "jitter of the stamps, flexing, ringing or clipping, or raise noise_scale")
+    checked = state.checks["checked"].max()
+    if adaptation["vague"] > max(_SAMPLES, _VAGUE * checked):
+        remarks.append(
+            f"the angular velocity is hardly known in {adaptation['vague']} of {checked} samples: "
+            "accelerometers tell its products alone, and by motion.jerk_density it may change by "
+            "as much from sample to sample; lower that if it does not, sample faster, or add a "
+            "gyroscope (use_gyro: true)")
     if motion > _WIDER and adaptation["samples"][1] > _MOSTLY * state.checks["checked"].max():
         remarks.append(
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "

@@ -29,7 +29,7 @@ from imu_fusion.estimation.smoother.surface_fit import (
     surface_fits,
 )
 from imu_fusion.estimation.smoother.surroundings import surroundings_of
-from imu_fusion.estimation.smoother.touch_down import likeliest
+from imu_fusion.estimation.smoother.touch_down import FOLLOWS, likeliest, near_ground
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, Log, MagLog, VelocityLog
@@ -189,15 +189,19 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
     widen(samples, wander)
     fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
-    jump, failure = None, ""
+    jump, near, failure = None, 0.0, ""
     if hill is not None and solution.events is not None:
+        near = near_ground(samples, states, solution.events, problem.constraints, problem.params)
         try:
             jump = jump_result(hill, at_surface(samples, states, problem.params),
                                problem.imu.log, solution.events, misfit_at_landing(fits))
+            if near > FOLLOWS:
+                jump = replace(jump, length_sd=float(np.hypot(
+                    jump.length_sd, near * jump.landing_speed)))
         except EstimationError as error:
             failure = str(error)
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
-                          residuals=residuals, wander=wander, failure=failure,
+                          residuals=residuals, wander=wander, near_ground=near, failure=failure,
                           log_likelihood=log_density(problem.readings)
                           - solution.last.surprise)

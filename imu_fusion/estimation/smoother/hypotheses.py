@@ -17,12 +17,15 @@ from imu_fusion.estimation.smoother.measurements.registry import KINDS
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
-_WHITE = 0.3         # of the stated noise that is left white where the rest wanders
+_DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
+_MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
 def fits(result: SmootherResult) -> bool:
@@ -46,6 +49,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     Args:
         found: under ``model``. smooth: a model -> its Attempt.
     """
+    given = model.params.to_mapping()
+    found, model = _deep_landing(found, model, smooth)
     if contradicted(found.result):
         return found.result
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
@@ -58,24 +63,53 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
             or any(is_many(outliers) for outliers in found.result.outliers().values())):
-        return found.result
-    given = model.params.to_mapping()
-    for alternatives in (_delays, _velocity_delays, _wandering_velocities, _wandering_fixes,
+        return _adapted(found, model, given)
+    for alternatives in (_delays, _velocity_delays, _wandering_fixes, _wandering_velocities,
                          _walks):
         for other in alternatives(found, model):
             found, model = _try(found, model, other, smooth)
+    # What wanders can have looked like a delay.
+    for name in (_DELAY, _VELOCITY_DELAY):
+        if model.params.get(name) != given[name]:
+            found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
+    return _adapted(found, model, given)
+
+
+def _adapted(found, model, given):
+    """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
 
 
+def _deep_landing(found, model, smooth):
+    """Without the heights of the second in which a body sinks deeply, if it stands afterwards; not
+    compared by likelihood, as these rows are left out."""
+    fit = found.result.surface.get("landing")
+    if (found.result.jump is None or fit is None or model.params.jump.event_margin >= _SINKS
+            or not (is_doubtful(found.result) or fit.first_excess > MOST_FIRST_EXCESS)):
+        return found, model
+    other = model.changed({"jump.event_margin": _SINKS})
+    try:
+        tried = smooth(other)
+    except EstimationError:
+        return found, model
+    lands = (tried.result.jump is not None and not is_doubtful(tried.result)
+             and stands_at_touch_down(tried.result, tried.problem.constraints, other.params))
+    better = is_doubtful(found.result) or (lands and tried.result.surface["landing"].first_excess
+                                           < fit.first_excess)
+    return (tried, other) if lands and better else (found, model)
+
+
+
+
 def _delays(found, model):
-    return _where_zero(model, {"gnss.time_offset_sd": 0.2})
+    return _where_zero(model, {_DELAY: 0.2})
 
 
 def _velocity_delays(found, model):
-    return _where_zero(model, {"gnss.velocity_time_offset_sd": 0.2})
+    return _where_zero(model, {_VELOCITY_DELAY: 0.2})
 
 
 def _walks(found, model):
@@ -83,24 +117,28 @@ def _walks(found, model):
 
 
 def _wandering_velocities(found, model):
-    return _wandering(found, model, "velocity", "gnss.velocity_error_sd", (1.0,))
+    return _wandering(found, model, "velocity", "gnss.velocity_error")
 
 
 def _wandering_fixes(found, model):
-    return _wandering(found, model, "fix", "gnss.position_error_sd", (1.0, 3.0))
+    return _wandering(found, model, "fix", "gnss.position_error")
 
 
-def _wandering(found, model, name, parameter, factors):
-    """Most of what is stated of readings, or some times as much, as an error that wanders."""
-    readings = found.problem.readings
-    of_kind = readings[readings["kind"] == KINDS[name]]
-    if not len(of_kind):
+def _wandering(found, model, name, error):
+    """What is left of readings as an error that wanders and noise that is white.
+
+    Neighbours differ by the noise. What else is left, the trajectory has followed in part.
+    """
+    left = found.result.residuals.get(name, ())
+    if len(left) < _FEWEST:
         return
-    root = np.linalg.inv(of_kind["whiten"])
-    sd = np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
-    for factor in factors:
-        for other in _where_zero(model, {parameter: tuple((factor * sd).tolist())}):
-            yield other._replace(noise={**model.noise, name: _WHITE})
+    white = float(_MAD * np.median(np.abs(np.diff(left, axis=0))) / np.sqrt(2.0))
+    slow = np.sqrt(np.maximum(np.mean(np.square(left), axis=0) - white ** 2, white ** 2))
+    readings = found.problem.readings
+    root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
+    sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
+    for other in _where_zero(model, {f"{error}_sd": tuple(sd.tolist())}):
+        yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
 
 
 def _where_zero(model, changes):

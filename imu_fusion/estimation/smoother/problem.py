@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +63,18 @@ class Change:
     def has_cov(self) -> bool:
         """Whether it was asked for covariances."""
         return len(self.cov) > 0
+
+
+class NoiseFactors(NamedTuple):
+    """Factors: ``noise`` (2,) of the densities of rates and forces, ``walk`` (2,) of the walks of
+    their biases; name of readings -> of their standard deviations (``receiver``); name of a block
+    that is a Gauss-Markov process -> of its variance density and of its correlation time
+    (``wander``)."""
+
+    noise: Sequence[float]
+    walk: Sequence[float]
+    receiver: Mapping[str, float]
+    wander: Mapping[str, Sequence[float]]
 
 
 def model_of(prior: StatePrior, around: Surroundings, lever_arm: Sequence[float]) -> np.ndarray:
@@ -202,26 +215,26 @@ class Problem:
         other.attach()
         return other
 
-    def log_likelihood(self, noise: Sequence[float], walk: Sequence[float],
-                       receiver: Mapping[str, float], most: int) -> float:
+    def log_likelihood(self, factors: NoiseFactors, most: int) -> float:
         """Logarithm of the likelihood of the readings of the first ``most`` samples, linear about
-        the trajectory, but for a constant.
-
-        Args:
-            noise, walk: factors (2,) of the noise of rates and forces and of the walks of their
-                biases. receiver: name of readings -> factor of their standard deviations.
-        """
+        the trajectory, with other noise; but for a constant."""
         n, count = self.size, min(most, len(self.x))
         intervals = self.intervals.copy()
         readings = self.readings[:self.reading_start[count]].copy()
         model = self.model.copy()
         for name, first, factor, drift in zip(("gyr_noise", "acc_noise"), (GYR_BIAS, ACC_BIAS),
-                                              noise, walk):
+                                              factors.noise, factors.walk):
             intervals[name] *= factor ** 2
             model["walk"][0, first:first + 3] *= drift ** 2
-        for name, factor in receiver.items():
+        for name, factor in factors.receiver.items():
             readings["whiten"][readings["kind"] == KINDS[name]] /= factor
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
+        for name, (walk, tau) in factors.wander.items():
+            first = getattr(self.blocks, name)
+            here = slice(first, first + 3)
+            model["walk"][0, here] *= walk
+            model["decay_rate"][0, here] /= tau
+            cov[here, here] *= walk * tau
         boxminus(self.mean, self.x[0], delta)
         _, surprise = filter_segment(
             0, count, False, self.x, delta, cov,

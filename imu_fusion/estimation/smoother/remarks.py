@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
+from imu_fusion.estimation.smoother.touch_down import FOLLOWS
 
 if TYPE_CHECKING:
     from imu_fusion.estimation.smoother.result import Outliers, SmootherResult
@@ -43,6 +44,7 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
     yield from _on_outliers(result)
     yield from _on_wander(result)
     yield from _on_place(result)
+    yield from _on_flight(result)
     yield from _on_surface(result)
 
 
@@ -83,8 +85,10 @@ def _on_single_pass(result):
 
 
 def _on_adapted(result):
-    if result.adapted or result.noise:
-        taken = [f"{name}: {_short(value)}" for name, value in result.adapted.items()]
+    adapted = {name: value for name, value in result.adapted.items()
+               if name != "jump.event_margin"}
+    if adapted or result.noise:
+        taken = [f"{name}: {_short(value)}" for name, value in adapted.items()]
         taken += [f"{factor:.2g} times the stated standard deviations of {name}"
                   for name, factor in result.noise.items()]
         yield ("with the noise as given the innovations wander or are larger than stated; "
@@ -129,16 +133,29 @@ def _on_wander(result):
 
 def _on_place(result):
     """Medians of the normalised innovations of fixes that cannot be chance where a surface holds
-    the trajectory."""
+    the trajectory; or the error that was taken, as it can be the surface's as well."""
     if not result.surface or "fix" not in result.innovations:
         return
-    values = result.innovations["fix"][1]
+    values, unit = result.innovations["fix"][1], "of their standard deviations"
     middle = np.median(values, axis=0)
-    if np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values)):
+    taken = "gnss.position_error_sd" in result.adapted
+    if taken:
+        middle, unit = np.median(result.states["gnss_position_error"][0], axis=0), "m"
+    if taken or np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values)):
         yield ("the fixes lie beside the trajectory that the surface holds, by "
-               + "/".join(f"{b:+.1f}" for b in middle) + " (east/north/up) of their standard "
-               "deviations: the origin of the surface may be off, the sensor ride above it "
-               "(surface.body_height) or the fixes wander (gnss.position_error_sd)")
+               + "/".join(f"{b:+.1f}" for b in middle) + f" {unit} (east/north/up): the origin of "
+               "the surface may be off, the sensor ride above it (surface.body_height) or the "
+               "fixes wander (gnss.position_error_sd)")
+
+
+def _on_flight(result):
+    if result.jump is not None and result.near_ground > FOLLOWS:
+        yield (f"for {result.near_ground:.1f} s before the touch-down the flight is close to the "
+               "landing profile or below it: the touch-down may have been earlier, and the length "
+               "is less certain by as much (jump.touchdown gives it)")
+    if "jump.event_margin" in result.adapted:
+        yield ("the first second of the landing stands off the profile, and what follows does not: "
+               "a deep landing; heights of that second are left out (jump.event_margin)")
 
 
 def _on_surface(result):

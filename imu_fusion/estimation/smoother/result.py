@@ -87,6 +87,8 @@ class SmootherResult:
     ``wander``: name -> how much larger than white noise leaves them its innovations are in the
     mean over seconds (:func:`.whiteness.wandering`), 1 where they are white; what is stated has
     been widened by it (:func:`.whiteness.widen`).
+    ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
+    or below it.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
@@ -106,6 +108,7 @@ class SmootherResult:
     adapted: dict[str, float] = field(default_factory=dict)
     noise: dict[str, float] = field(default_factory=dict)
     wander: dict[str, float] = field(default_factory=dict)
+    near_ground: float = 0.0
     failure: str = ""
     log_likelihood: float = -np.inf
 

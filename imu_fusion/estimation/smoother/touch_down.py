@@ -6,20 +6,22 @@ a "flight" follows the profile; or the contact is claimed where the trajectory i
 """
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, table_crossing
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.points import at_surface
-from imu_fusion.estimation.smoother.result import SmootherResult
-from imu_fusion.estimation.smoother.surface_fit import SurfaceFit
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.surfaces.constraint import Constraint
 from imu_fusion.surfaces.hill import Hill
 
+if TYPE_CHECKING:
+    from imu_fusion.estimation.smoother.result import SmootherResult
+
 _CLOSE = 0.3          # m above the profile, within which a body is not in the air
-_FOLLOWS = 0.3        # s, for which a flight may be so close: the last drop takes less
+FOLLOWS = 0.3         # s, for which a flight may be so close: the last drop takes less
 _SHORTEST = 0.3       # s, that a flight takes at least: what is earlier belongs to the push-off
 _APART = 0.3          # s, between two impacts
 _RISE = 2.0           # m/s^2, of an impact above the force before it
@@ -28,8 +30,8 @@ _MISFIT = 1.5         # excess of a surface, from which a contact is doubted
 _SPREAD = 1.0         # m, over which heights in the air are spread: what a contact is told from
 
 
-def likeliest(first: SmootherResult, hill: Hill, imu: ImuLog, params: SmootherParams,
-              smooth: Callable[[JumpEvents], SmootherResult | None]) -> SmootherResult:
+def likeliest(first: "SmootherResult", hill: Hill, imu: ImuLog, params: SmootherParams,
+              smooth: Callable[[JumpEvents], "SmootherResult | None"]) -> "SmootherResult":
     """The result with the likeliest touch-down; the first one unless the hill contradicts it.
 
     Args:
@@ -37,44 +39,51 @@ def likeliest(first: SmootherResult, hill: Hill, imu: ImuLog, params: SmootherPa
         imu: of the recording. params: SmootherParams.
         smooth: result for given events, None where there is none.
     """
-    constraints = hill.constraints()
-    landing = next(c for c in constraints if c.phase == "landing" and c.height)
-    height = _height(first, landing, params)
-    stamp, events = first.samples["stamp"], first.events
+    events = first.events
     assert events is not None
-    if first.jump is not None and not is_doubtful(height, stamp, events,
-                                                  first.surface.get(landing.name)):
+    if first.jump is not None and not is_doubtful(first):
         return first
     takeoff = table_crossing(hill, first.samples, None) or events.takeoff
-    tries = [first_contact(height, stamp, events), *impacts(imu, takeoff)]
+    tries = [events.touchdown - round(first.near_ground * 1e9), *impacts(imu, takeoff)]
     others = [smooth(JumpEvents(takeoff, touchdown)) for touchdown in tries
               if abs(touchdown - events.touchdown) > _APART * 1e9 or first.jump is None]
     results = [r for r in (first, *others) if r is not None and r.jump is not None]
     if not results:
         return first
-    return min(results, key=lambda r: unexplained(r, constraints, params))
+    return min(results, key=lambda r: unexplained(r, hill.constraints(), params))
 
 
-def is_doubtful(height: np.ndarray, stamp: np.ndarray, events: JumpEvents,
-                fit: SurfaceFit | None) -> bool:
-    """Whether a flight follows the profile, or a landing does not.
+def stands_at_touch_down(result: "SmootherResult", constraints: Sequence[Constraint],
+                         params: SmootherParams) -> bool:
+    """Whether the body is at its height above the profile when it touches down: later heights,
+    from which alone that follows, are those of a body that stands."""
+    assert result.events is not None
+    landing = _landing(constraints)
+    touch = np.searchsorted(result.samples["stamp"], result.events.touchdown)
+    return bool(abs(_height(result.samples, result.states, landing, params)[touch]) < _CLOSE)
+
+
+def is_doubtful(result: "SmootherResult") -> bool:
+    """Whether a flight follows the profile, or a landing does not."""
+    fit = result.surface.get("landing")
+    return fit is None or fit.excess > _MISFIT or result.near_ground > FOLLOWS
+
+
+def near_ground(samples: np.ndarray, states: dict[str, tuple[np.ndarray, np.ndarray]],
+                events: JumpEvents, constraints: Sequence[Constraint], params: SmootherParams
+                ) -> float:
+    """For how long, in s, until the touch-down a flight is close to the landing profile, or below.
 
     Args:
-        height: (n,) m above the landing profile; stamp: (n,) ns. events: of this result.
-        fit: of the landing, None if it holds nowhere.
+        samples, states, events: of the SmootherResult. constraints: of the hill.
+        params: SmootherParams.
     """
-    if fit is None or fit.excess > _MISFIT:
-        return True
-    return events.touchdown - first_contact(height, stamp, events) > _FOLLOWS * 1e9
-
-
-def first_contact(height: np.ndarray, stamp: np.ndarray, events: JumpEvents) -> int:
-    """Stamp from which on, until the touch-down, the trajectory is close to the profile."""
+    stamp = samples["stamp"]
+    height = _height(samples, states, _landing(constraints), params)
     air = (stamp > events.takeoff + _SHORTEST * 1e9) & (stamp < events.touchdown)
-    high = np.flatnonzero(air & ~(np.abs(height) < _CLOSE))
-    if len(high):
-        return int(stamp[high[-1]])
-    return int(stamp[air][0]) if air.any() else events.touchdown
+    high = np.flatnonzero(air & ~(height < _CLOSE))
+    began = stamp[high[-1]] if len(high) else np.min(stamp[air], initial=events.touchdown)
+    return float(events.touchdown - began) * 1e-9
 
 
 def impacts(imu: ImuLog, takeoff: int) -> np.ndarray:
@@ -93,7 +102,7 @@ def impacts(imu: ImuLog, takeoff: int) -> np.ndarray:
     return np.array([at for _, at in sorted(rises, reverse=True)[:_MOST]], np.int64)
 
 
-def unexplained(result: SmootherResult, constraints: Sequence[Constraint],
+def unexplained(result: "SmootherResult", constraints: Sequence[Constraint],
                 params: SmootherParams) -> float:
     """Negative log-likelihood of the touch-down of a result, up to a constant of the recording.
 
@@ -112,7 +121,8 @@ def unexplained(result: SmootherResult, constraints: Sequence[Constraint],
     for constraint in constraints:
         if constraint.phase != "landing":
             continue
-        below = np.minimum(_height(result, constraint, params)[air], 0.0) / constraint.sigma
+        height = _height(result.samples, result.states, constraint, params)[air]
+        below = np.minimum(height, 0.0) / constraint.sigma
         cost += step * np.nansum(np.log1p(0.5 * below ** 2))
         fit = result.surface.get(constraint.name)
         if fit is not None:
@@ -124,7 +134,11 @@ def unexplained(result: SmootherResult, constraints: Sequence[Constraint],
     return float(cost)
 
 
-def _height(result, landing, params):
+def _landing(constraints):
+    return next(c for c in constraints if c.phase == "landing" and c.height)
+
+
+def _height(samples, states, landing, params):
     """Heights (n,) m of the body above the landing profile."""
-    points = at_surface(result.samples, result.states, params)["position_world"]
+    points = at_surface(samples, states, params)["position_world"]
     return landing.evaluate(points)[0] - params.surface.body_height

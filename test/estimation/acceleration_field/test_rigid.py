@@ -278,3 +278,72 @@ def test_filter_object_needs_no_estimator():
     rows = RigidBodyFilter(PARAMS, estimator.array, start).process(
         np.array([0, 1_000_000]), np.zeros((2, 12)))
     assert rows["stamp"].tolist() == [0, 1_000_000] and not rows["flags"].any()
+
+
+def spinning(rate, duration, omega, alpha):
+    """(stamp, omega, alpha) of a body that turns about one axis; functions of s give rad/s and
+    rad/s^2."""
+    t = np.arange(int(duration * rate)) / rate
+    axis = np.array([0.2, -0.1, 0.97]) / np.linalg.norm([0.2, -0.1, 0.97])
+    return np.round(t * 1e9).astype(np.int64), omega(t)[:, None] * axis, alpha(t)[:, None] * axis
+
+
+def felt_at_centre(omega, alpha, random, noise):
+    """Readings (n, 4, 3) of :func:`sensors` of a body that turns about their common centre, which
+    is not accelerated, without gravity."""
+    places = PAPER_POSITIONS - PAPER_POSITIONS.mean(axis=0)
+    field = np.array([np.cross(alpha, p) + np.cross(omega, np.cross(omega, p)) for p in places])
+    return np.einsum("kij,knj->nki", PAPER_AXES, field) + random.normal(
+        0, noise, (len(omega), 4, 3))
+
+
+@pytest.mark.parametrize("rate", [20.0, 50.0])
+def test_slow_samples_of_a_fast_turn_do_not_diverge(rate):
+    """The densities let omega change by many rad/s between samples: what one sample tells of its
+    products must hold it."""
+    stamp, omega, alpha = spinning(
+        rate, 12.0, lambda t: 17.0 * np.sin(0.8 * t) ** 2, lambda t: 13.6 * np.sin(1.6 * t))
+    params = AccelerationFieldParams(
+        sample_rate=rate, gravity=0.0, initial=Initial(mode="given", orientation_sd=1e-3))
+    estimator = AccelerationFieldEstimator(
+        params, sensors(noise_density=0.1 / rate ** 0.5, bias_sd=0.0, reports="acceleration"))
+    rows = estimator.run(stamp, felt_at_centre(omega, alpha, np.random.default_rng(1), 0.1))
+    error = np.linalg.norm(rows["omega"] - omega, axis=1)
+    sd = np.sqrt(np.trace(rows["cov_omega"], axis1=1, axis2=2))
+    assert np.all(error < 4.0 * sd + 1e-6)
+    # Of one sign or the other, never more than the body turns.
+    assert sd[5:].max() < 2.0 * 17.0
+    fast = np.linalg.norm(omega, axis=1) > 8.0
+    # Whatever its sign, |omega|^2 is in every sample: minus half of the gradient's trace.
+    square = -0.5 * np.trace(rows["gradient"], axis1=1, axis2=2)
+    assert np.median(np.abs(square / np.sum(omega ** 2 + 1e-9, axis=1) - 1.0)[fast]) < 0.05
+
+
+def test_the_sign_of_an_unknown_rate_is_open_until_it_changes():
+    stamp, omega, alpha = spinning(
+        1000.0, 0.6, lambda t: 10.0 + np.where(t > 0.2, 60.0 * (t - 0.2) ** 2, 0.0),
+        lambda t: np.where(t > 0.2, 120.0 * (t - 0.2), 0.0))
+    params = AccelerationFieldParams(gravity=0.0, initial=Initial(
+        mode="given", angular_velocity_sd=20.0))
+    estimator = AccelerationFieldEstimator(
+        params, sensors(noise_density=0.02 / 1000 ** 0.5, bias_sd=0.0, reports="acceleration"))
+    rows = estimator.run(stamp, felt_at_centre(omega, alpha, np.random.default_rng(2), 0.02))
+    error = np.linalg.norm(rows["omega"] - omega, axis=1)
+    sd = np.sqrt(np.trace(rows["cov_omega"], axis1=1, axis2=2))
+    assert 3.0 < sd[2] < 15.0    # both signs
+    assert np.all(error < 3.0 * sd)
+    assert error[-1] < 0.5 and sd[-1] < 0.5
+
+
+def test_a_body_that_hardly_turns_says_nothing_of_the_mounting():
+    """Noise must not pass for motion: at rest no reading tells how the sensors sit as a whole."""
+    params = AccelerationFieldParams(initial=Initial(mode="rest", duration=0.2))
+    estimator = AccelerationFieldEstimator(params, sensors(noise_density=3e-3, position_sd=1e-3,
+                                                           axes_sd=0.035))
+    up = np.einsum("kij,j->ki", PAPER_AXES, [0.0, 0.0, 9.80665])
+    readings = up + np.random.default_rng(3).normal(0, 0.1, (1500, 4, 3))
+    estimator.run(np.arange(1500, dtype=np.int64) * 1_000_000, readings)
+    for fit in estimator.sensor_fits():
+        assert np.all(np.abs(fit.position_error) < fit.position_error_sd)
+        assert np.allclose(fit.position_error_sd, np.sqrt(0.75) * 1e-3, rtol=0.01)
+    assert estimator.remarks() == []

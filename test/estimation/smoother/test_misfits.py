@@ -114,3 +114,17 @@ def test_unknown_status_is_usable_and_a_covariance_of_nan_is_unknown():
     log = FixLog(np.array([5]), *(values[i:i + 1] for i in range(3)),
                  values[3:12].reshape(1, 3, 3), values[12:])
     assert log.usable.all() and not check_fix(log)
+
+
+def test_errors_that_wander_are_no_delay_in_the_end(logs, monkeypatch):
+    """At first a delay of the velocities explains part of it; once the wander is known, none."""
+    imu, mag, fix, velocity = logs
+    rng, error = np.random.default_rng(4), np.zeros((len(fix), 3))
+    for k in range(1, len(fix)):    # Gauss-Markov: 5 m over 20 s
+        error[k] = np.exp(-0.005) * error[k - 1] + 0.5 * rng.standard_normal(3)
+    enu = FRAME.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height) + error
+    stated = np.broadcast_to(np.eye(3), (len(fix), 3, 3))
+    result = Smoother(PARAMS).run(
+        imu, mag, FixLog(fix.stamp, *FRAME.to_geodetic(enu), stated, fix.status), velocity)
+    assert "gnss.position_error_sd" in result.adapted
+    assert not any("time_offset" in name for name in result.adapted)

@@ -47,6 +47,15 @@ def test_a_fall_is_told_and_makes_the_length_less_certain(start):
     assert any("a fall, a deep landing" in remark for remark in result.remarks())
 
 
+@pytest.mark.parametrize("start", [-40.0, -90.0])
+def test_a_deep_landing_lengthens_no_jump(start):
+    jump = SkiJump(HILL, JumpParams(start_x=start, sink_time=0.12))
+    result = smoothed(jump)
+    assert abs(result.jump.length - jump.length) < min(3 * result.jump.length_sd, 0.5)
+    assert result.adapted == {"jump.event_margin": 1.0}
+    assert any("a deep landing" in remark for remark in result.remarks())
+
+
 def test_a_touch_down_that_was_given_is_not_replaced():
     jump = SkiJump(HILL, JumpParams(start_x=-50.0))
     recording = record(jump, np.random.default_rng(0))
