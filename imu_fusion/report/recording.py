@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import shown
 from imu_fusion.evaluation.orientation_error import (
     OrientationErrors,
     moving_at,
@@ -161,8 +160,8 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
     sections = [_summary(material), overview_section(contents.topics, material.origin),
                 *_estimates(material), *_measurements(material)]
     date = datetime.datetime.fromtimestamp(contents.start * 1e-9, datetime.UTC)
-    write_report(path, shown(Path(bag).resolve().name), sections,
-                 f"{shown(str(bag))}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
+    write_report(path, Path(bag).resolve().name, sections,
+                 f"{bag}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
     return Written(material.smoothed, not contents.damaged, sections)
 
 
