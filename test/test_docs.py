@@ -92,6 +92,22 @@ def test_commands_in_comments_of_presets_are_read(path, tmp_path):
     assert not checker.problems, "\n".join(checker.problems)
 
 
+def only_in_presets():
+    """Commands in comments of presets, on recordings that are here, that no page carries out."""
+    pages = "".join(page.read_text() for page in CARRIED_OUT)
+    return [line for path in sorted((ROOT / "config").rglob("*.yaml")) for line in commented(path)
+            if " bags/" in line and f"process {line.split()[2]} " not in pages]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", only_in_presets())
+def test_commands_in_comments_of_presets_do_what_they_say(line, folder):
+    """With process for pipeline, which writes the same through nodes."""
+    words = line.replace("imu_fusion pipeline", "imu_fusion process").split()[1:]
+    result = CliRunner().invoke(cli.cli, words, catch_exceptions=False)
+    assert result.exit_code == 0 and f"written: {words[2]}" in result.output, result.output
+
+
 def test_a_wrong_command_in_a_comment_is_found(tmp_path):
     (tmp_path / "preset.yaml").write_text("# For a bag:\n#   imu_fusion proces BAG OUT\na: 1\n")
     (line,) = commented(tmp_path / "preset.yaml")

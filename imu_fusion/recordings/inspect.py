@@ -121,7 +121,7 @@ def _conclude(reader: Reader, collectors: "Mapping[str, LogCollector | _Stamps]"
         imus = [report.log for report in reports
                 if isinstance(report.log, ImuLog) and report.count]
         for report in reports:
-            whole[report.topic].add(_with_axes(report, imus))
+            whole[report.topic].add(_beside(report, imus))
 
 
 class _Stretches:
@@ -206,12 +206,15 @@ def inspect_log(name: str, msgtype: str, log: Log) -> TopicReport:
                        tuple(r for r in ranges if r is not None), tuple(findings), log=log)
 
 
-def _with_axes(report, imus):
-    """Add how a magnetometer turns against the only Imu of the recording."""
-    if not isinstance(report.log, MagLog) or len(imus) != 1:
+def _beside(report, imus):
+    """Add whether a sensor has the time of the only Imu of the recording, and how a magnetometer
+    turns against it."""
+    if report.log is None or len(imus) != 1 or isinstance(report.log, ImuLog):
         return report
-    return replace(report, findings=(*report.findings,
-                                     *check_axes(imus[0], report.log, report.topic)))
+    found = checks.check_clock(report.log.stamp, imus[0].stamp, report.topic)
+    if isinstance(report.log, MagLog):
+        found += check_axes(imus[0], report.log, report.topic)
+    return replace(report, findings=(*report.findings, *found))
 
 
 class _Stamps:

@@ -23,6 +23,7 @@ from imu_fusion.errors import ImuFusionError
 
 # A number with its unit, a dash for none, or nothing: columns of these are set to the right.
 _NUMBER = re.compile(r"^([-+]?\d[\d.,]*(e[-+]?\d+)?( ?\S{1,4})?|–|)$")
+_SENTENCE = 40    # characters: longer cells are read, not looked up
 
 
 @dataclass(frozen=True)
@@ -80,19 +81,26 @@ class Table:
     caption: str = ""
 
     def render(self) -> str:
-        numeric = [all(_NUMBER.match(str(row[i])) for row in self.rows) for i in
-                   range(len(self.header))]
-        head = "".join(self._cell("th", *pair) for pair in zip(self.header, numeric))
-        body = "".join("<tr>" + "".join(self._cell("td", *pair) for pair in zip(row, numeric))
+        kinds = [self._kind(i) for i in range(len(self.header))]
+        head = "".join(self._cell("th", *pair) for pair in zip(self.header, kinds))
+        body = "".join("<tr>" + "".join(self._cell("td", *pair) for pair in zip(row, kinds))
                        + "</tr>" for row in self.rows)
         # Not <caption>: that is as wide as the table, of which a phone shows a part.
         caption = f'<p class="caption">{html.escape(self.caption)}</p>' if self.caption else ""
         return (f'{caption}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
                 f"<tbody>{body}</tbody></table></div>")
 
+    def _kind(self, column):
+        """Class of a column: of numbers, of sentences, which a narrow page must not squeeze, or
+        none."""
+        cells = [str(row[column]) for row in self.rows]
+        if all(map(_NUMBER.match, cells)):
+            return "number"
+        return "prose" if max(map(len, cells)) > _SENTENCE else ""
+
     @staticmethod
-    def _cell(tag, content, numeric):
-        kind = ' class="number"' if numeric else ""
+    def _cell(tag, content, kind):
+        kind = f' class="{kind}"' if kind else ""
         return f"<{tag}{kind}>{html.escape(str(content))}</{tag}>"
 
 
@@ -177,7 +185,8 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section], subt
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(render_report(title, sections, subtitle), encoding="utf-8")
+        path.write_text(render_report(title, sections, subtitle), encoding="utf-8",
+                        errors="backslashreplace")    # names of files may be no text
     except OSError as error:
         raise ImuFusionError(f"{path}: the report cannot be written ({error.strerror})") from None
 

@@ -136,6 +136,19 @@ def check_stamps(stamp: np.ndarray, name: str) -> list[Finding]:
     return result
 
 
+def check_clock(stamp: np.ndarray, imu_stamp: np.ndarray, name: str) -> list[Finding]:
+    """A finding if a topic lies beside the Imu's time altogether: stamps (n,) and (m,) int64 ns."""
+    if len(stamp) < 2 or len(imu_stamp) < 2:
+        return []
+    first, last = int(imu_stamp.min()), int(imu_stamp.max())
+    if ((stamp >= first) & (stamp <= last)).any():
+        return []
+    ahead = (int(np.median(stamp)) - int(np.median(imu_stamp))) * 1e-9
+    return [Finding("stamp", f"{name}: no sample lies within the Imu's time; its stamps are "
+                             f"{abs(ahead):.3g} s {'later' if ahead > 0 else 'earlier'}: another "
+                             "clock, and none of it can be used with the Imu")]
+
+
 def check_finite(values: np.ndarray, name: str, quantity: str) -> list[Finding]:
     """A finding about rows (n, ...) that are not numbers."""
     values = np.asarray(values)

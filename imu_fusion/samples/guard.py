@@ -9,7 +9,9 @@ it tell a clock that was set from a stamp that is wild.
 - Set *back*, by however little: samples come again for times that have been measured already. The
   same true time has two stamps then, and none of them says how much time has passed: a new
   *epoch* begins, and estimators start anew with it.
-- Set *ahead*: a gap, over which estimators predict; beyond ``OTHER_CLOCK`` a new epoch, too.
+- Set *ahead*: a gap, over which estimators predict; beyond ``OTHER_CLOCK`` a new epoch, too. One
+  sample ahead, and the others behind it again: its stamp is wild. Were it believed, all those up to
+  it would be refused.
 
 All of this follows from the sequence of the samples of a topic alone, not from when they come.
 """
@@ -25,6 +27,9 @@ from imu_fusion.samples.logs import AnyLog
 
 JUMP = 1_000_000_000
 """Nanoseconds. Transport delays reorder samples by less, sensors pause for less."""
+
+AHEAD = 50_000_000
+"""Nanoseconds. What is ahead by more waits for the sample after it."""
 
 OTHER_CLOCK = 7 * 86400 * 1_000_000_000
 """Nanoseconds. No recording pauses for so long; a computer that boots without a clock jumps by
@@ -104,10 +109,10 @@ class Guard:
             return found
         fine = np.isfinite(values).all(axis=1) & (stamp >= 0)
         step = stamp[1:] - stamp[:-1]
-        breaks = np.flatnonzero(~(fine[1:] & (step > 0) & (step <= JUMP))) + 1
+        breaks = np.flatnonzero(~(fine[1:] & (step > 0) & (step <= AHEAD))) + 1
         i = 0
         while i < n:
-            if not self._held and fine[i] and self._follows(int(stamp[i]), JUMP):
+            if not self._held and fine[i] and self._follows(int(stamp[i]), AHEAD):
                 following = int(breaks.searchsorted(i + 1))
                 end = int(breaks[following]) if following < len(breaks) else n
                 self._accept(found, stamp[i:end], values[i:end])
@@ -139,14 +144,14 @@ class Guard:
 
     def _is_usual(self, stamp: np.ndarray, values: np.ndarray) -> bool:
         """Whether nothing is to be judged: each sample is fine and follows the one before."""
-        if self._held or not len(stamp) or not self._follows(int(stamp[0]), JUMP):
+        if self._held or not len(stamp) or not self._follows(int(stamp[0]), AHEAD):
             return False
         if stamp[0] < 0 or not np.isfinite(values).all():
             return False
         if len(stamp) == 1:
             return True
         step = stamp[1:] - stamp[:-1]
-        return bool(step.min() > 0 and step.max() <= JUMP)
+        return bool(step.min() > 0 and step.max() <= AHEAD)
 
     def _follows(self, stamp: int, limit: int) -> bool:
         return self.last is None or 0 < stamp - self.last <= limit
@@ -167,7 +172,7 @@ class Guard:
                     self._believe(found)
                 return
             self._drop(found)
-        if follows:
+        if self._follows(stamp, max(AHEAD, _SLOW * self._interval)):
             self._accept(found, np.array([stamp]), row[None])
         elif stamp == self.last or self._repeats(stamp, row):
             self._refuse(found, stamp, Verdict.DUPLICATE)
@@ -182,10 +187,8 @@ class Guard:
         held = self._held[-1][0]
         if stamp <= held or (held < self.last < stamp and stamp > held + limit):
             return 0
-        if not follows:
+        if held > self.last or not follows:
             return 1
-        if held > self.last:
-            return 0
         # Set back by a few intervals, or overtaken: the interval that is more like the others.
         usual = self._usual()
         return 2 if abs(stamp - held - usual) <= abs(stamp - self.last - usual) else 0

@@ -6,6 +6,7 @@ leaves nothing open needs no description.
 """
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -156,7 +157,7 @@ def _layout(lines: list[str], delimiter: str, decimal: str) -> _Layout:
     like = [(k, cells) for k, cells in rows if len(cells) > 1 and numeric[k] >= 0.5 * len(cells)]
     if len(like) < 3:
         return _Layout(0.0)
-    width = int(np.median([len(cells) for _, cells in like]))
+    width = Counter(len(cells) for _, cells in like).most_common(1)[0][0]
     body = [(k, cells) for k, cells in like if len(cells) == width]
     first = body[0][0]
     above = [(k, cells) for k, cells in rows if k < first]

@@ -8,6 +8,7 @@ import random
 import shutil
 import sqlite3
 import struct
+import zipfile
 import zlib
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from benchmarks.fuzz import KINDS, mutated, outcome, write_db3, write_mcap, writ
 from imu_fusion.calibrate.files import read_topic
 from imu_fusion.cli import cli
 from imu_fusion.errors import INCOMPLETE, BagError
-from imu_fusion.messages.convert import fix_message, imu_message
+from imu_fusion.messages.convert import fix_message, imu_message, mag_message
 from imu_fusion.messages.layouts import FIX, IMU, MAG
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.nodes.pipeline import find_left_out, plan_pipeline
@@ -333,6 +334,20 @@ def test_a_broken_message_among_many_stops_no_door_and_is_counted_alike(tmp_path
     assert len(lost) == 1 and "1 messages cannot be decoded" in lost[0]
 
 
+def test_two_clocks_in_one_recording_are_told(tmp_path):
+    """A magnetometer whose computer has not been told the time beside an Imu that has."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(200):
+            writer.write("/imu/data_raw", IMU.msgtype, imu_message(
+                START + i * STEP, "imu", [0.0, 0.0, 0.1], [0.0, 0.0, 9.81]), START + i * STEP)
+            writer.write("/imu/mag", MAG.msgtype, mag_message(
+                100 * 10**9 + i * STEP, "imu", [2e-5, 0.0, -4e-5]), START + i * STEP)
+    for door in ("info", "process"):
+        result = through(door, tmp_path / "bag", tmp_path / "out")
+        assert result.exit_code == 0
+        assert "imu/mag: no sample lies within the Imu's time" in result.output
+
+
 @pytest.mark.parametrize("log_time", [0, 1, 2**63, 2**64 - 1])
 def test_log_times_at_the_ends_of_their_range(tmp_path, log_time):
     file = mcap(tmp_path / "t.mcap", schema(IMU.msgtype), channel("/imu"),
@@ -411,7 +426,11 @@ def test_what_is_compressed_otherwise_is_told_how_to_unpack(tmp_path):
     file = write_mcap(tmp_path, "none")
     (tmp_path / "t.mcap.gz").write_bytes(gzip.compress(file.read_bytes()))
     (tmp_path / "t.mcap.zstd").write_bytes(zstandard.compress(b"no recording"))
-    for name, words in (("t.mcap.gz", "gzip -d"), ("t.mcap.zstd", "not an MCAP file")):
+    with zipfile.ZipFile(tmp_path / "whole.zip", "w") as archive:
+        archive.write(file, "t.csv")
+    (tmp_path / "t.zip").write_bytes((tmp_path / "whole.zip").read_bytes()[:-30])
+    for name, words in (("t.mcap.gz", "gzip -d"), ("t.mcap.zstd", "not an MCAP file"),
+                        ("t.zip", "cut off")):
         result = through("info", tmp_path / name, None)
         assert result.exit_code == 1 and words in result.output
         assert f"{tmp_path / name}:" in result.output    # and not the unpacked copy

@@ -96,7 +96,8 @@ def evil_recording(directory, topic):
 def test_strings_of_a_recording_cannot_become_markup(tmp_path):
     topic = f"/reference/{EVIL}"
     out = tmp_path / "report.html"
-    write_recording_report(evil_recording(tmp_path / "b<i>ag", topic), tmp_path / "b<i>ag", out)
+    bag = tmp_path / "b<i>ag\udcff"    # a name that is no text, either
+    write_recording_report(evil_recording(bag, topic), bag, out)
     page = Page(out.read_text())
     assert not [tag for tag, attributes in page.tags if tag in ("img", "i", "iframe")]
     assert not [a for _, attributes in page.tags for a in attributes if a.startswith("on")]
@@ -124,11 +125,14 @@ def test_a_report_needs_nothing_from_outside(tmp_path):
 def test_all_blocks_are_shown_and_columns_of_numbers_set_to_the_right():
     text = render_report("T", [Section("S", (
         Numbers((Number("RMSE", "1.5°", "moving"),)), Notes(("careful",)),
-        Table(("name", "value"), (("a", "1.25"), ("b", "–"))),))], "below")
+        Table(("name", "value"), (("a", "1.25"), ("b", "–"))),
+        Table(("name", "why"), (("a", "x"), ("b", "a sentence that a narrow page would squeeze"))),
+        Table(("none",), ())))], "below")
     page = Page(text)
     for word in ("T", "below", "RMSE", "1.5°", "moving", "careful", "1.25"):
         assert word in page.text
-    assert text.count('<td class="number">') == 2 and text.count('<th class="number">') == 1
+    assert text.count('<td class="number">') == 2 and text.count('<th class="number">') == 2
+    assert text.count('<td class="prose">') == 2
 
 
 def test_a_report_that_cannot_be_written_is_told(tmp_path):

@@ -106,13 +106,13 @@ def test_a_sensor_without_a_say_in_the_clock_refuses_what_is_less_than_a_jump_ba
     assert {epoch for epoch, _ in kept} == {0}
 
 
-@pytest.mark.parametrize("wild", [400 * DAY / MS, 3e3, -3e3, -300 * DAY / MS])
+@pytest.mark.parametrize("wild", [400 * DAY / MS, 3e3, 500.0, 65.0, -3e3, -300 * DAY / MS])
 @pytest.mark.parametrize("place", [1, 25, 49])
 def test_a_single_wild_stamp_is_left_out(wild, place):
     stamps = list(REGULAR)
     stamps[place] += wild
     kept, refused = judge(stamps)
-    if place == 49 and wild == 3e3:
+    if place == 49 and 0 < wild <= 3e3:
         return    # at the end nothing tells it from a pause
     assert refused == {Verdict.WILD: 1}
     assert kept == [(0, t) for i, t in enumerate(REGULAR) if i != place]

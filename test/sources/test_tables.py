@@ -291,3 +291,8 @@ def test_a_px4_log_is_forward_left_up_and_its_estimate_agrees(tmp_path):
     norm = np.linalg.norm(mag.mag, axis=1)
     assert 20e-6 < np.median(norm) < 70e-6
     assert logs["/fix"].cov_enu[:, 0, 0].min() > 0
+
+
+def test_as_many_rows_of_one_width_as_of_another():
+    """Found by benchmarks/fuzz.py."""
+    assert sketch(b"1,2\n" * 3 + b"1,2,3,4\n" * 3, "t.csv").unused == ["1", "2"]

@@ -32,6 +32,9 @@ def parts(path: Path, most: int | None = None) -> Iterator[tuple[str, bytes]]:
                 yield from _pieces(file, most)
         elif zipfile.is_zipfile(path) and path.suffix.lower() not in (".xlsx", ".xls"):
             yield from _unpacked(path, most)
+        elif path.suffix.lower() == ".zip":
+            raise BagError(f"{path}: no zip archive, or cut off: the list of its contents, at its "
+                           "end, is missing; copy it again")
         else:
             yield from _pieces(path, most)
     except OSError as error:
