@@ -21,7 +21,7 @@ from sensor_msgs.msg import Imu
 from benchmarks.acceleration_field_live import cpu_seconds
 from benchmarks.table import RESULTS
 from imu_fusion.messages.layouts import IMU
-from imu_fusion.nodes.flow import sensor_qos
+from imu_fusion.nodes.flow.qos import sensor_qos
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.sources.source import EPOCH
 

@@ -10,7 +10,7 @@ from imu_fusion.errors import DeviceError, ParameterError, SampleError
 from imu_fusion.nodes.base import IDLE, Node
 from imu_fusion.nodes.device_file import DeviceFile, Lot
 from imu_fusion.nodes.device_topics import DeviceTopic, DriverSensor
-from imu_fusion.nodes.flow import reliable_qos, sensor_qos, steady_timer
+from imu_fusion.nodes.flow import live_qos, steady_timer
 from imu_fusion.parameters.bounded_yaml import read_yaml
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.recordings.source_storage import in_range
@@ -88,9 +88,9 @@ class Driver(Node):
             self._connection = Connection(
                 open_transport(p.transport, self._source.request), wake.trigger, p.silence,
                 p.longest_pause, p.reconnect)
-        qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()
         topics = self._file.topics if self._file else self._source.topics
-        self._outputs = {topic: DeviceTopic(self, topic, self._frame(topic), p.sensor, qos)
+        self._outputs = {topic: DeviceTopic(self, topic, self._frame(topic), p.sensor,
+                                            live_qos(p.qos))
                          for topic in topics}
         self._clocks: dict[str, DeviceClock] = {}
         self._held: list[Lot] = []    # until the clocks are known

@@ -19,8 +19,9 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import EstimationError, ImuFusionError, TopicError
 from imu_fusion.kernels import announced_compiling
-from imu_fusion.nodes.base import IDLE, Node, message_class, output_class
-from imu_fusion.nodes.flow import END, NAP_PATIENT, Flow, reliable_qos, sensor_qos
+from imu_fusion.nodes.base import IDLE
+from imu_fusion.nodes.estimator import EstimatorNode
+from imu_fusion.nodes.flow import END, NAP_PATIENT, reliable_qos
 from imu_fusion.signals import end_after
 from imu_fusion.streams import smoother as smoothing
 from imu_fusion.streams.smoother import (
@@ -32,7 +33,7 @@ from imu_fusion.streams.smoother import (
     outputs_of,
     required_of,
 )
-from imu_fusion.streams.stream import one_by_one
+from imu_fusion.streams.stream import EstimatorNodeParams, one_by_one
 from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
@@ -103,36 +104,26 @@ class _Child:
         self._folder.cleanup()
 
 
-class SmootherNode(Node):
+class SmootherNode(EstimatorNode):
     """Trajectory from imu/data_raw, imu/mag, fix and fix_velocity, when smoother/smooth is called.
 
     Services (std_srvs/Trigger): ~/smooth, ~/clear.
     """
 
     NAME = "smoother"
-    PARAMETERS = (SmootherNodeParams, SmoothingParams)
+    TASK = "collection"
+    PARAMETERS = (EstimatorNodeParams, SmootherNodeParams, SmoothingParams)
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         p, smoothing_params = self.params(SmootherNodeParams), self.params(SmoothingParams)
-        # What is refused is refused before others see a reader of ours and wait for its answer.
         if smoothing_params.surface.file:
             load_surface(smoothing_params.surface.file)
-        types = {topic: output_class(msgtype)
-                 for topic, msgtype in outputs_of(smoothing_params).items()}
-        self._stream = SmootherStream(smoothing_params, p.memory_limit * 1e6,
-                                      self.get_logger().warning)
         self._at_end = p.smooth_at_end
-        self._flow = Flow(self, on_begin=self._on_begin, nap=NAP_PATIENT)
+        stream = SmootherStream(smoothing_params, p.memory_limit * 1e6, self.get_logger().warning)
+        self.attach(stream, outputs_of(smoothing_params), _latched(1), relays=False,
+                    nap=NAP_PATIENT, on_begin=self._on_begin)
         self._source = self._flow.source
-        self.problems = self._flow.problems
-        qos = {"reliable": reliable_qos, "sensor_data": sensor_qos}[p.qos]()
-        self._names = {}  # resolved name -> ours
-        for topic, kind in INPUTS.items():
-            taken = self._flow.input(message_class(kind.layout.msgtype), topic, qos)
-            self._names[taken.topic] = topic
-        self._outputs = {topic: self._flow.output(msg_type, topic, _latched(1))
-                         for topic, msg_type in types.items()}
         self._child: Any = None
         self._answer: Any = None  # a Future: (whether it was smoothed, what is said of it)
         self._result = self._messages = None
@@ -140,19 +131,12 @@ class SmootherNode(Node):
         self.create_service(Trigger, "~/smooth", self._on_smooth,
                             callback_group=ReentrantCallbackGroup())
         self.offer("clear", self._clear)
-        self.start_diagnostics("collection", self._status)
 
     def work(self) -> float:
         """One turn: take all that waits, smooth, publish. See :meth:`Node.work`."""
         self._flow.send()
         turn = self._flow.take()
-        if turn.blocks:
-            self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
-                               for topic, messages in turn.blocks.items()})
-        if turn.ended:
-            self._stream.end([self._names[topic] for topic in turn.ended])
-        if turn.event:
-            self._stream.finish()    # a last sample after a long pause waits for one after it
+        self.publish(self.through(turn))
         self._flow.finish(turn)
         if self._at_end and turn.event == END:
             self._insist(self._replay_broke_off(turn.over) or self._start())
@@ -164,21 +148,22 @@ class SmootherNode(Node):
             return 0.0
         return 0.0 if self._publish() else self._flow.pause(IDLE)
 
+    def stop(self) -> None:
+        """At once: what is not smoothed will not be."""
+        self.finished = True
+
     def close(self) -> None:
         """End the child, if there is one."""
-        self._flow.close()
+        super().close()
         if self._child is not None:
             self._child.close()
 
     def _on_begin(self, session):
         played = {self._names.get(topic) for topic in session.said.topics} & INPUTS.keys()
-        if played:
-            self._stream.reset()
-            missing = [topic for topic in required_of(self._stream.params)
-                       if topic not in played]
-            if missing and self._at_end:
-                raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there "
-                                 "will be nothing to smooth")
+        missing = [topic for topic in required_of(self._stream.params) if topic not in played]
+        if played and missing and self._at_end:
+            raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there "
+                             "will be nothing to smooth")
 
     @staticmethod
     def _replay_broke_off(sessions):

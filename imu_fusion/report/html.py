@@ -185,7 +185,8 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section], subt
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(render_report(title, sections, subtitle), encoding="utf-8")
+        path.write_text(render_report(title, sections, subtitle), encoding="utf-8",
+                        errors="backslashreplace")    # names of files may be no text
     except OSError as error:
         raise ImuFusionError(f"{path}: the report cannot be written ({error.strerror})") from None
 

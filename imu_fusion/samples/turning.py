@@ -300,8 +300,17 @@ def check_axes(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
         return stuck
     verdict = field_verdict(imu, mag)
     if verdict.kind == "axes":
-        return [_other_axes(verdict, name)]
+        return [_other_axes(_northern(verdict, imu, mag), name)]
     return _scatter(imu, mag, name)
+
+
+def _northern(verdict, imu, mag):
+    """The Verdict with the signs with which the field points down, as on the northern hemisphere:
+    reversed, it stands still as well."""
+    time, measured = seconds(imu.stamp, imu.stamp[0]), seconds(mag.stamp, imu.stamp[0])
+    up = np.column_stack([np.interp(measured, time, imu.acc[:, i]) for i in range(3)])
+    upwards = float(np.nanmean(np.sum((mag.mag @ verdict.axes.T) * up, axis=1)))
+    return Verdict(verdict.kind, -verdict.axes) if upwards > 0.0 else verdict
 
 
 def _other_axes(verdict, name):
@@ -309,11 +318,14 @@ def _other_axes(verdict, name):
     matrix = ", ".join(f"{v:.3g}" for v in (verdict.axes + 0.0).ravel())
     how = (f"it fits if x, y, z of the Imu are ({verdict.letters}) of the magnetometer"
            if verdict.letters else
-           f"it fits if the magnetometer is turned by {np.degrees(verdict.angle):.0f} deg")
+           "it fits if the magnetometer is turned" + (
+               " and mirrored" if np.isnan(verdict.angle) else
+               f" by {np.degrees(verdict.angle):.0f} deg"))
     if verdict.letters == "y, x, -z":
         how += " (an AK8963, as inside of an MPU-9250)"
-    return Finding("axes", f"{name}: the field does not turn as the gyroscope says, {how}: turn it "
-                           f"in the driver, or set sensor.mag_matrix: [{matrix}]", unusable=True)
+    return Finding("axes", f"{name}: the field does not turn as the gyroscope says, {how}; on "
+                           "the southern hemisphere with all signs reversed: turn it in the "
+                           f"driver, or set sensor.mag_matrix: [{matrix}]", unusable=True)
 
 
 def _stuck(imu, mag, name):

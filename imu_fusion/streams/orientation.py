@@ -36,12 +36,17 @@ from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.turning import check_axes, check_turning
 from imu_fusion.sensors.linear_calibration import ImuCalibration
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
+from imu_fusion.streams.stage import Stage, check_logs
+from imu_fusion.streams.stream import (
+    FIX_TOPIC,
+    IMU_TOPIC,
+    MAG_TOPIC,
+    Conclusion,
+    EstimatorNodeParams,
+    Messages,
+    Stream,
+)
 
-FIX_TOPIC = "fix"
-MAG_TOPIC = "imu/mag"
-IMU_TOPIC = "imu/data_raw"
 ORIENTATION_TOPIC = "imu/data"
 RPY_TOPIC = "imu/rpy/filtered"
 STEADY_TOPIC = "imu/steady_state"
@@ -270,12 +275,12 @@ class OrientationStream(Stream):
     def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         imu = samples.get(IMU_TOPIC, _NO_IMU)
         mag = samples.get(MAG_TOPIC, _NO_MAG)
-        if self.params.mode == "smoothed":
-            self._kept.append((imu, mag))
-            self._find_north(*samples.get(FIX_TOPIC, _NO_FIX))
-            return []
         # What is published from the first fix on refers to true north.
         stamp, turn = self._first_north(*samples.get(FIX_TOPIC, _NO_FIX))
+        if self.params.mode == "smoothed":
+            self._kept.append((imu, mag))
+            self._writer.turn += turn
+            return []
         made: list[Messages] = []
         if stamp is not None:
             before = [np.searchsorted(stamps, stamp) for stamps, _ in (imu, mag)]
@@ -345,12 +350,6 @@ class OrientationStream(Stream):
             found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
         return [finding.text for finding in found]
 
-    def _find_north(self, stamps, values):
-        """Turn to true north once a fix tells where it is: whatever is published."""
-        stamp, turn = self._first_north(stamps, values)
-        if stamp is not None:
-            self._writer.turn += turn
-
     def _first_north(self, stamps, values):
         """(stamp, turn) of the first fix that tells true north; (None, 0.0) if none does, or if it
         is known."""
@@ -399,17 +398,8 @@ def warm_up(params: OrientationParams) -> None:
 
 
 def findings(logs: Mapping[str, Any]) -> list[Finding]:
-    """What looks wrong with whole logs.
-
-    Args:
-        logs: dict of input topic to log, as recorded.
-    """
-    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
-    if MAG_TOPIC in logs:
-        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
-        found += checks.check_clock(logs[MAG_TOPIC].stamp, logs[IMU_TOPIC].stamp, MAG_TOPIC)
-        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
-    return found
+    """What looks wrong with whole logs as recorded, but for the fixes: one is enough."""
+    return check_logs({topic: log for topic, log in logs.items() if topic != FIX_TOPIC})
 
 
 def _configure(stage, params_file):

@@ -34,17 +34,21 @@ from imu_fusion.messages.layouts import (
 from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE, transform_messages
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.samples import checks
 from imu_fusion.samples.blocks import Samples, joined
-from imu_fusion.samples.findings import Finding
-from imu_fusion.samples.turning import check_axes
 from imu_fusion.sensors.linear_calibration import ImuCalibration
-from imu_fusion.streams.stage import Stage
-from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
+from imu_fusion.streams.stage import Stage, check_logs
+from imu_fusion.streams.stream import (
+    FIX_TOPIC,
+    IMU_TOPIC,
+    MAG_TOPIC,
+    VELOCITY_TOPIC,
+    Conclusion,
+    EstimatorNodeParams,
+    Messages,
+    Stream,
+)
 from imu_fusion.surfaces.file import load_surface
 
-IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
-FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
 INPUTS = {topic: SAMPLE_TYPES[layout.msgtype] for topic, layout in (
     (IMU_TOPIC, IMU), (MAG_TOPIC, MAG), (FIX_TOPIC, FIX), (VELOCITY_TOPIC, TWIST))}
 _REQUIRED = (IMU_TOPIC, FIX_TOPIC)
@@ -120,7 +124,7 @@ class SmoothingParams(SmootherParams):
 
 
 @dataclass(frozen=True)
-class SmootherNodeParams(EstimatorNodeParams):
+class SmootherNodeParams(Parameters):
     """What concerns the node, not the trajectory."""
 
     smooth_at_end: bool = param(
@@ -448,18 +452,6 @@ def _path(samples, stamp, world):
     return bytes(TYPES.serialize_cdr(path, PATH_TYPE))
 
 
-def findings(logs: Mapping[str, Any]) -> list[Finding]:
-    """What looks wrong with whole logs as recorded."""
-    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
-    if FIX_TOPIC in logs:
-        found += checks.check_fix(logs[FIX_TOPIC])
-    if MAG_TOPIC in logs:
-        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
-        found += checks.check_clock(logs[MAG_TOPIC].stamp, logs[IMU_TOPIC].stamp, MAG_TOPIC)
-        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
-    return found
-
-
 def _configure(stage, params_file):
     (params,) = stage.read_params(params_file)
     if params.surface.file:
@@ -467,5 +459,5 @@ def _configure(stage, params_file):
     return replace(stage, required=required_of(params), outputs=outputs_of(params)), [params]
 
 
-STAGE = Stage(_NAME, (SmoothingParams,), (SmootherNodeParams,), INPUTS, _REQUIRED, OUTPUTS,
-              SmootherStream, findings, _configure)
+STAGE = Stage(_NAME, (SmoothingParams,), (EstimatorNodeParams, SmootherNodeParams), INPUTS,
+              _REQUIRED, OUTPUTS, SmootherStream, check_logs, _configure)

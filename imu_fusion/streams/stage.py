@@ -8,7 +8,22 @@ from typing import Any
 from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import ParamsFile, parameters_for
+from imu_fusion.samples import checks
 from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.turning import check_axes
+from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC
+
+
+def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
+    """What looks wrong with whole logs as recorded, Imu, magnetometer and fixes by topic."""
+    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
+    if FIX_TOPIC in logs:
+        found += checks.check_fix(logs[FIX_TOPIC])
+    if MAG_TOPIC in logs:
+        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
+        found += checks.check_clock(logs[MAG_TOPIC].stamp, logs[IMU_TOPIC].stamp, MAG_TOPIC)
+        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+    return found
 
 
 def _no_findings(logs: Mapping) -> list[Finding]:

@@ -22,6 +22,9 @@ from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Guard, Verdict
 from imu_fusion.sensors.linear_calibration import ImuCalibration
 
+IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
+FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
+
 
 @dataclass(frozen=True)
 class EstimatorNodeParams(Parameters):

@@ -4,8 +4,8 @@ import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64, String
 
-from imu_fusion.nodes.flow import END, NEXT, sensor_qos, sink, source
-from imu_fusion.nodes.flow.qos import session_qos
+from imu_fusion.nodes.flow import END, NEXT, sink, source
+from imu_fusion.nodes.flow.qos import sensor_qos, session_qos
 from imu_fusion.nodes.flow.source import WINDOW
 from imu_fusion.nodes.flow.state import MARK
 from test.nodes.flow_parts import Doubler, Part, Receiver, Sender, twice

@@ -32,28 +32,29 @@ TOPICS = {"/smoother/odometry": Odometry, "/smoother/imu": Imu, "/smoother/fix":
           "/smoother/results": DiagnosticArray}
 
 
-def write(path, count=600, without_fixes=range(0), broken=()):
+def write(path, count=600, without_fixes=range(0), broken=(), set_back=None):
     """Standing still at Innsbruck for two seconds, then off to the east at 1 m/s^2.
 
     without_fixes: numbers of Imu samples beside which there is no fix. broken: of those whose
-    message has 60 bytes.
+    message has 60 bytes. set_back: that from which on the clock is behind by an hour.
     """
     rng = np.random.default_rng(5)
     with BagWriter(path) as writer:
         for i in range(count):
-            stamp = START + i * STEP
+            at = START + i * STEP
+            stamp = at - (3600 * 10**9 if set_back is not None and i >= set_back else 0)
             t = max(0.0, (i - 200) * STEP * 1e-9)
             noise = rng.normal(0, 0.01, 3)
             force = [1.0 if t else 0.0, 0.0, 9.805]
             cdr = imu_message(stamp, "car", 0.001 * noise, force + noise)
-            writer.write("/imu/data_raw", IMU.msgtype, cdr[:60] if i in broken else cdr, stamp)
+            writer.write("/imu/data_raw", IMU.msgtype, cdr[:60] if i in broken else cdr, at)
             if i % 10 == 0 and i not in without_fixes:
                 east = 0.5 * t * t
                 writer.write("/fix", FIX.msgtype, fix_message(
                     stamp, "gnss", 47.26, 11.39 + np.degrees(east / (6388e3 * np.cos(0.8248))),
-                    600.0, np.eye(3)), stamp)
+                    600.0, np.eye(3)), at)
                 writer.write("/fix_velocity", TWIST.msgtype, velocity_message(
-                    stamp, "world", [t, 0.0, 0.0], 0.01 * np.eye(3)), stamp)
+                    stamp, "world", [t, 0.0, 0.0], 0.01 * np.eye(3)), at)
     return path
 
 
@@ -88,6 +89,16 @@ def test_service_smooths_what_was_played_and_equals_batch(graph, tmp_path):
     # It did go east: the last odometry is at 0.5 * 3.99^2 m.
     values = LAYOUTS["nav_msgs/msg/Odometry"].decode(sink.messages["/smoother/odometry"][-1])[2]
     assert values[0] == pytest.approx(0.5 * 3.99 ** 2, abs=0.5)
+
+
+def test_of_a_replay_whose_clock_is_set_back_the_longest_stretch_is_collected(graph, tmp_path):
+    """As in batch: live it would be the last one."""
+    bag = write(tmp_path / "bag", set_back=400)
+    node = graph.start(SmootherNode, qos="reliable")
+    replayer = graph.start(Replayer, bag=str(bag), rate=0.0)
+    graph.until(lambda: replayer.finished)
+    imu = node._stream.logs()["imu/data_raw"]
+    assert len(imu) == 400 and imu.stamp[0] == START
 
 
 class Here:

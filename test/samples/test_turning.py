@@ -75,6 +75,16 @@ def test_axes_of_the_magnetometer_are_named_with_the_parameter():
     assert check_axes(imu, MagLog(mag.stamp, mag.mag + [5e-6, -8e-6, 5e-6]), "mag") == []
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_reversed_axis_of_the_magnetometer_is_told_from_the_two_others(axis):
+    """The reversed field stands still as well: that it points down tells which of them it is."""
+    imu, mag = recording()
+    mirrored = np.diag([-1.0 if i == axis else 1.0 for i in range(3)])
+    (finding,) = check_axes(imu, MagLog(mag.stamp, mag.mag @ mirrored), "mag")
+    matrix = np.array(ast.literal_eval(finding.text.split("mag_matrix: ")[1])).reshape(3, 3)
+    assert np.array_equal(matrix, mirrored)
+
+
 def test_a_magnetometer_that_stands_still_or_scatters_is_told():
     imu, mag = recording()
     (finding,) = check_axes(imu, MagLog(mag.stamp, mag.mag[:1] + 0 * mag.mag), "mag")

@@ -4,7 +4,7 @@ A *session* is one pass of data from a node that sends it (the replayer, or a no
 processes the session of somebody else). What makes it lossless:
 
 1. **DDS holds back.** Writers are RELIABLE KEEP_LAST 1000, readers in a session KEEP_ALL. After
-   250 messages (or 16 MB) a writer waits until all are acknowledged; an acknowledged message is
+   500 messages (or 16 MB) a writer waits until all are acknowledged; an acknowledged message is
    in the queue of the reader. A full queue acknowledges nothing. In a node between, what may not
    leave waits, and while anything waits the node does not take: its queues fill, its writers stop.
 2. **Each node says what it does**, on one latched topic of its own, ``<node>/_flow/<instance>``
@@ -31,7 +31,7 @@ of one state are waited for, ten seconds, and then both given up.
 Without a session (live drivers) nobody waits. Other people's subscribers are named
 (:attr:`Flow.foreign`). One that acknowledges nothing cannot stop a session: those who joined
 tell twice a second how much they have taken, and that opens the writer as well (so it is slow,
-500 messages a second). The same numbers bound what waits in queues: 64 MB a topic.
+1000 messages a second). The same numbers bound what waits in queues: 64 MB a topic.
 
 Limits. Each hop buffers up to 1000 messages a topic (fastdds.xml; 5000 with other profiles). Nobody
 can tell the messages of two publishers of one topic: a second one is named and its messages are
@@ -42,9 +42,9 @@ answer ``wait_for_all_acked`` at once.
 """
 
 from imu_fusion.nodes.flow.flow import Flow
-from imu_fusion.nodes.flow.qos import DEPTH, reliable_qos, sensor_qos, steady_timer
+from imu_fusion.nodes.flow.qos import DEPTH, live_qos, reliable_qos, steady_timer
 from imu_fusion.nodes.flow.sink import NAP_LIVE, NAP_PATIENT, Turn
 from imu_fusion.nodes.flow.state import BEGIN, END, NEXT
 
 __all__ = ["BEGIN", "DEPTH", "END", "NAP_LIVE", "NAP_PATIENT", "NEXT", "Flow", "Turn",
-           "reliable_qos", "sensor_qos", "steady_timer"]
+           "live_qos", "reliable_qos", "steady_timer"]

@@ -34,6 +34,11 @@ def sensor_qos() -> QoSProfile:
                       reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
+def live_qos(name: str) -> QoSProfile:
+    """That of the parameter ``qos``: 'reliable' or 'sensor_data'."""
+    return reliable_qos() if name == "reliable" else sensor_qos()
+
+
 def session_qos() -> QoSProfile:
     """The QoS of readers in a session: what is not taken is not overwritten."""
     return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
