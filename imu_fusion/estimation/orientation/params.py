@@ -11,10 +11,11 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.parameters.record import record
 from imu_fusion.sensors.params import sensor
 
-# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope, and
-# that accelerations come and go, is given up where the samples are a thousand times likelier so.
+# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope is
+# given up where the samples are a thousand times likelier without it, that accelerations come and
+# go where they are a million times: poor gyroscopes gain likelihood that way, too.
 _LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.1), math.log(0.001)
-_LOG_ODDS_LASTING = math.log(0.001)
+_LOG_ODDS_LASTING = math.log(1e-6)
 # Vehicles vibrate: by how much the gyroscope is noisier where accelerations last (a car: 3e-3).
 _VIBRATION = 10.0
 # Rotation from ENU to the world frame that is published, xyzw.
