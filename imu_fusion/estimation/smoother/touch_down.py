@@ -32,7 +32,8 @@ _SPREAD = 1.0         # m, over which heights in the air are spread: what a cont
 
 def likeliest(first: "SmootherResult", hill: Hill, imu: ImuLog, params: SmootherParams,
               smooth: Callable[[JumpEvents], "SmootherResult | None"]) -> "SmootherResult":
-    """The result with the likeliest touch-down; the first one unless the hill contradicts it.
+    """The result with the likeliest touch-down; the first one unless the hill contradicts it, or
+    there was an impact in what is taken for its flight.
 
     Args:
         first: smoothed with the events that were detected.
@@ -41,10 +42,12 @@ def likeliest(first: "SmootherResult", hill: Hill, imu: ImuLog, params: Smoother
     """
     events = first.events
     assert events is not None
-    if first.jump is not None and not is_doubtful(first):
-        return first
     takeoff = table_crossing(hill, first.samples, None) or events.takeoff
-    tries = [events.touchdown - round(first.near_ground * 1e9), *impacts(imu, takeoff)]
+    felt = impacts(imu, takeoff)
+    if (first.jump is not None and not is_doubtful(first)
+            and not np.any(felt < events.touchdown - _APART * 1e9)):
+        return first
+    tries = [events.touchdown - round(first.near_ground * 1e9), *felt]
     others = [smooth(JumpEvents(takeoff, touchdown)) for touchdown in tries
               if abs(touchdown - events.touchdown) > _APART * 1e9 or first.jump is None]
     results = [r for r in (first, *others) if r is not None and r.jump is not None]
