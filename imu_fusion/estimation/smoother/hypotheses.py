@@ -102,8 +102,6 @@ def _deep_landing(found, model, smooth):
     return (tried, other) if lands and better else (found, model)
 
 
-
-
 def _delays(found, model):
     return _where_zero(model, {_DELAY: 0.2})
 
@@ -137,8 +135,9 @@ def _wandering(found, model, name, error):
     readings = found.problem.readings
     root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
     sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
-    for other in _where_zero(model, {f"{error}_sd": tuple(sd.tolist())}):
-        yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
+    for more in (1.0, 3.0):
+        for other in _where_zero(model, {f"{error}_sd": tuple((more * sd).tolist())}):
+            yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
 
 
 def _where_zero(model, changes):
