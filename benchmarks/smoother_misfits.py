@@ -20,7 +20,7 @@ from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog
 from imu_fusion.simulation.jump_sensors import record
-from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
+from imu_fusion.simulation.ski_jump import Fall, JumpParams, SkiJump
 from imu_fusion.surfaces.file import load_surface
 
 SEEDS, SECONDS = 20, 60.0
@@ -156,16 +156,6 @@ def car(every: int, with_velocity: bool) -> Callable:
 def withheld(row):
     result, error, cov = smoother_drive.withheld(*smoother_drive.load(), DEFAULTS)
     row.add(error, cov, result.remarks())
-
-
-class Fall(SkiJump):
-    """Beginning 0.2 s after touch-down, the sensor comes down by 0.8 m within 0.5 s, for good."""
-
-    def _sink(self, t):
-        s = np.clip((t - self.t_touchdown - 0.2) / 0.5, 0.0, 1.0)
-        return super()._sink(t) - 0.8 * np.stack([
-            s ** 3 * (10 - 15 * s + 6 * s * s), 30 * (s * (1 - s)) ** 2 / 0.5,
-            60 * s * (1 - s) * (1 - 2 * s) / 0.25])
 
 
 def jumps(kind: type[SkiJump], *landings: dict) -> Callable:

@@ -327,3 +327,14 @@ class SkiJump:
         """What an ideal gyroscope reads (n, 3), rad/s: the Earth's rotation included."""
         spin = earth_rate_world(self.hill.origin.latitude_deg)
         return motion.omega_imu + Rotation.from_quat(motion.quat_world_imu).inv().apply(spin)
+
+
+class Fall(SkiJump):
+    """A jump that ends in a fall: beginning 0.2 s after touch-down, the sensor comes down by 0.8 m
+    within 0.5 s, for good."""
+
+    def _sink(self, t):
+        s = np.clip((t - self.t_touchdown - 0.2) / 0.5, 0.0, 1.0)
+        return super()._sink(t) - 0.8 * np.stack([
+            s ** 3 * (10 - 15 * s + 6 * s * s), 30 * (s * (1 - s)) ** 2 / 0.5,
+            60 * s * (1 - s) * (1 - 2 * s) / 0.25])

@@ -5,20 +5,10 @@ import pytest
 
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.simulation.jump_sensors import record
-from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
+from imu_fusion.simulation.ski_jump import Fall, JumpParams, SkiJump
 from imu_fusion.surfaces.file import load_surface
 
 HILL = load_surface("oberstdorf_hs106")
-
-
-class Fall(SkiJump):
-    """Beginning 0.2 s after touch-down, the sensor comes down by 0.8 m within 0.5 s."""
-
-    def _sink(self, t):
-        s = np.clip((t - self.t_touchdown - 0.2) / 0.5, 0.0, 1.0)
-        return super()._sink(t) - 0.8 * np.stack([
-            s ** 3 * (10 - 15 * s + 6 * s * s), 30 * (s * (1 - s)) ** 2 / 0.5,
-            60 * s * (1 - s) * (1 - 2 * s) / 0.25])
 
 
 def smoothed(jump, seed=0):
