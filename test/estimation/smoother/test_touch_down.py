@@ -37,6 +37,13 @@ def test_a_fall_is_told_and_makes_the_length_less_certain(start):
     assert any("a fall, a deep landing" in remark for remark in result.remarks())
 
 
+def test_a_fall_that_is_harder_than_the_landing_is_not_taken_for_it():
+    jump = Fall(HILL, JumpParams(start_x=-70.0, duration=30.0, sink_time=0.12, braking=3.5))
+    result = smoothed(jump.shaken(np.random.default_rng([0, 1])))
+    assert abs(result.jump.length - jump.length) < min(3 * result.jump.length_sd, 1.0)
+    assert result.remarks()
+
+
 @pytest.mark.parametrize("start", [-40.0, -90.0])
 def test_a_deep_landing_lengthens_no_jump(start):
     jump = SkiJump(HILL, JumpParams(start_x=start, sink_time=0.12))
