@@ -10,9 +10,9 @@ from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator
 from imu_fusion.estimation.orientation.gyro_limit import ranges_of
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
-from imu_fusion.estimation.orientation.rows import SATURATED_AXES_SHIFT
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import BAND
+from imu_fusion.sensors.unmixing import unmix
 
 
 def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLog:
@@ -24,8 +24,10 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLo
     at two instants are unsure.
 
     While one axis is clipped, the others err, too: a calibration that mixes axes was applied to
-    what had been clipped. That error stands still in the sensor, so that it goes together for as
-    long as the body takes for half a turn.
+    what had been clipped. Where the tops tell how it mixes (:mod:`imu_fusion.sensors.unmixing`),
+    what was missing is mixed in once it is recovered, and all is recovered again. Elsewhere that
+    error stands still in the sensor, so that it goes together for as long as the body takes for
+    half a turn.
 
     Args:
         imu, mag: the whole recording. params: of method fusion; mode and range are set here.
@@ -36,17 +38,36 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLo
     if mag is None or not len(mag):
         raise EstimationError("rates beyond the gyroscope's range are recovered from the "
                               "magnetometer, and there is none: leave recover_rates false")
+    imu = imu[np.isfinite(imu.gyr).all(axis=1)]
     limits = (ranges_of(imu.gyr, kernel_parameters(params)) if params.sensor.gyro_range is None
               else np.broadcast_to(params.sensor.gyro_range, 3))
-    # Behind a calibration what was clipped is no longer flat.
-    at_limit = tuple(float(v) for v in np.where(np.isfinite(limits), (1.0 - BAND) * limits, 1e6))
-    estimator = OrientationEstimator(params.replace(
-        **{"mode": "smoothed", "sensor.gyro_range": at_limit}))
-    rows = np.concatenate([estimator.run(imu, mag), estimator.finish()])
-    missing = (rows["flags"][:, None] >> (SATURATED_AXES_SHIFT + np.arange(3))) & 1 == 1
-    sd = np.where(missing, _in_bursts(rows, missing),
-                  _beside_bursts(rows, missing, at_limit, params.sensor.gyro_scale_sd))
+    tops = unmix(imu.gyr, limits, BAND)
+    mixing = tops.matrix - np.eye(3)
+    rows, used = _fused(imu, mag, imu.gyr, tops.clipped, params)
+    if tops.known.any():
+        beyond = np.where(tops.clipped[used], rows["gyr"] - tops.seen[used], 0.0)
+        mixed = imu.gyr.copy()
+        mixed[used] += beyond @ mixing.T
+        rows, used = _fused(imu, mag, mixed, tops.clipped, params)
+    missing = tops.clipped[used]
+    recovered = np.where(missing, _in_bursts(rows, missing), 0.0)
+    sd = np.where(missing, recovered, np.where(
+        tops.known, recovered @ np.abs(mixing).T,
+        _beside_bursts(rows, missing, limits, params.sensor.gyro_scale_sd)))
     return ImuLog(rows["stamp"], rows["gyr"], rows["acc"], imu.frame_id, sd)
+
+
+def _fused(imu, mag, gyr, clipped, params):
+    """Rows of the smoothed filter of rates (n, 3) that are ``clipped`` (n, 3), and the indices of
+    the samples that they are of."""
+    # Flat tops that nothing else reaches: that is how the filter knows them.
+    top = 1.011 * np.abs(gyr).max(axis=0, initial=0.0) + 1e-3
+    flat = np.where(clipped, np.copysign(top, gyr), gyr)
+    estimator = OrientationEstimator(params.replace(
+        **{"mode": "smoothed", "sensor.gyro_range": tuple(float(v) for v in top)}))
+    rows = np.concatenate([estimator.run(ImuLog(imu.stamp, flat, imu.acc), mag),
+                           estimator.finish()])
+    return rows, np.searchsorted(imu.stamp, rows["stamp"])
 
 
 def _step(rows):
@@ -67,7 +88,7 @@ def _beside_bursts(rows, missing, limits, mixing):
 
     limits: (3,) rad/s. mixing: standard deviation of the calibration's off-diagonal entries.
     """
-    beyond = np.where(missing, np.abs(rows["gyr"]) - np.array(limits), 0.0)
+    beyond = np.where(missing, np.abs(rows["gyr"]) - limits, 0.0)
     beyond = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)[:, None]
     rate = np.linalg.norm(rows["gyr"], axis=1)[:, None]
     half_turn = np.pi / np.maximum(rate * _step(rows), 1e-12)
