@@ -295,10 +295,10 @@ def without_errors(seed):
     """Smoother of the whole 70 s where nothing but the noise of the samples errs: calibrations are
     exact, no rate is clipped and none is missing."""
     ball = Ball(seed, EXACT)
-    ball.known = {"sensor.gyro_bias_sd": 1e-5, "sensor.gyro_scale_sd": 0.0,
+    ball.known |= {"sensor.gyro_bias_sd": 1e-5, "sensor.gyro_scale_sd": 0.0,
                   "sensor.acc_matrix_sd": 0.0, "sensor.acc_bias_sd": 1e-5,
                   "sensor.acc_noise_density": 0.03, "sensor.mag_axes_sd": 0.0,
-                  "sensor.mag_bias_sd": 0.0, "sensor.mag_scale_sd": 0.0,
+                  "sensor.mag_bias_sd": 1e-9, "sensor.mag_scale_sd": 1e-6,
                   "sensor.mag_noise_sd": 3e-7}
     return smoother(ball, ball.log.imu, -3.0, 73.0)
 
