@@ -35,8 +35,8 @@ def unmix(gyr: np.ndarray, limits: np.ndarray, band: float) -> Unmixed:
 
     Args:
         gyr: (n, 3) rad/s, as recorded. limits: (3,) rad/s, about where the tops are; infinite for
-            an axis without one. band: share of the limit within which samples count as clipped on
-            an axis whose tops tell nothing else.
+            an axis without one. band: share of the limit within which samples count as
+            clipped.
     """
     matrix, known = np.eye(3), np.zeros(3, bool)
     seen, clipped = gyr, np.abs(gyr) >= (1.0 - band) * limits
@@ -48,7 +48,8 @@ def unmix(gyr: np.ndarray, limits: np.ndarray, band: float) -> Unmixed:
         seen = gyr @ np.linalg.inv(matrix).T
     for i, tops in enumerate(found):
         if tops is not None:
-            clipped[:, i] = tops[1]
+            level = np.median(np.abs(seen[tops[1], i]))
+            clipped[:, i] = tops[1] | (np.abs(seen[:, i]) >= (1.0 - band) * level)
     return Unmixed(matrix, known, seen, clipped)
 
 
