@@ -75,8 +75,8 @@ def _sweep(reckoned):
                                                                           fig.HIGHLIGHT),
                                             ("condition", fig.REFERENCE)), 1):
         figure.add_trace(go.Scatter(
-            x=np.float32(_RHOS), y=np.float32([getattr(f, name) for f in found]), name=name,
-            mode="lines+markers", line=dict(color=color, width=1.5)), row=1, col=column)
+            x=np.float32(_RHOS), y=np.float32(np.array([getattr(f, name) for f in found])),
+            name=name, mode="lines+markers", line=dict(color=color, width=1.5)), row=1, col=column)
     fig.style(figure, height=330)
     figure.update_layout(legend=dict(orientation="h", x=0, y=1.0, yanchor="bottom"))
     figure.update_xaxes(type="log", title_text="\u03c1")

@@ -229,7 +229,8 @@ def _velocities(seen, secant, boxes):
             y += [low, low, high, high, low, np.nan]
     if x:
         figure.add_trace(go.Scatter(
-            x=np.float32(x), y=np.float32(y), mode="lines", name="range gates", fill="toself",
+            x=np.float32(np.array(x)), y=np.float32(np.array(y)), mode="lines",
+            name="range gates", fill="toself",
             fillcolor="rgba(123,135,148,0.25)", line=dict(color=fig.REFERENCE, width=1)))
     return _labelled(figure, "distance down the slope secant in m", "speed in m/s")
 

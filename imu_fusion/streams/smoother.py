@@ -274,9 +274,8 @@ def recovery_params(params: SmootherParams) -> OrientationParams:
     """Parameters of the orientation estimator that recovers rates for the smoother: its sensor, and
     a body in free fall and under blows, whose force says nothing of gravity and whose spin has
     inertia."""
-    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_range", "mag_offset", "mag_matrix")
-    if params.sensor.gyro_scale_sd > 0.0:
-        shared += ("gyro_scale_sd",)
+    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_scale_sd", "gyro_range", "mag_offset",
+              "mag_matrix")
     return OrientationParams().replace(**{
         "fusion.use_acc": False, "fusion.angular_acc_sd": 100.0, "fusion.angular_acc_time": 0.1,
         **{f"sensor.{name}": getattr(params.sensor, name) for name in shared}})
