@@ -21,26 +21,32 @@ class Gpx(Source):
     def __init__(self, strict: bool = True) -> None:
         super().__init__(strict)
         self._parser: Any = ElementTree.XMLPullParser(["end"])
-        self._part, self._seen = "", 0
+        self._part, self._seen, self._broken = "", 0, ""
 
     def feed(self, data: bytes, part: str = "") -> list[Block]:
         self._part = part
+        if self._broken:
+            return []
         if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
             raise SampleError(f"{part}: declares entities, which no track needs")
         try:
             self._parser.feed(data)
-            return self._points()
-        except ElementTree.ParseError as error:
-            raise SampleError(f"{part}: no GPX ({error})") from None
+        except ElementTree.ParseError as error:    # what comes before it is kept
+            self._broken = f"is no GPX from some place on ({error})"
+        return self._points()
 
     def finish(self) -> list[Block]:
-        try:
-            self._parser.close()
-        except ElementTree.ParseError as error:
-            raise SampleError(f"{self._part}: ends in the middle ({error})") from None
-        blocks = self._points()
+        if not self._broken:
+            try:
+                self._parser.close()
+            except ElementTree.ParseError as error:
+                self._broken = f"ends in the middle ({error})"
+        blocks = [] if self._broken else self._points()
         if not self._seen:
-            raise SampleError(f"{self._part}: no track points with time and elevation")
+            raise SampleError(f"{self._part}: "
+                              + (self._broken or "no track points with time and elevation"))
+        if self._broken:
+            self.lost[f"part of the track, as {self._part} {self._broken}"] += 1
         return blocks
 
     def _points(self) -> list[Block]:

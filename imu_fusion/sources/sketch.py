@@ -15,7 +15,7 @@ import numpy as np
 from imu_fusion.errors import SampleError
 from imu_fusion.sources import units
 from imu_fusion.sources.header import ONES, TIME, WEEK, Column, column_of
-from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, decoded, is_number
+from imu_fusion.sources.source import BROKEN, EPOCH, STANDARD_GRAVITY, decoded, is_number
 from imu_fusion.sources.times import NANOSECONDS, calendar, is_calendar
 
 _LINES = 3000           # that are looked at
@@ -103,17 +103,18 @@ def sketch(data: bytes, where: str) -> Sketch:
     if best.score <= 0:
         raise SampleError(f"{where}: no rows of numbers are found; a table has a line for each "
                           "sample")
+    rows = _sound(best)
     result = Sketch()
     delimiter = {"\t": "tab"}.get(best.delimiter, best.delimiter)
     for key, value, usual in (("delimiter", delimiter, ","), ("decimal", best.decimal, "."),
                               ("skip_lines", best.skip, 0), ("header", best.header, True)):
         if value != usual:
             result.content[key] = value
-    values = {name: np.array([_value(row[k], best.decimal) for row in best.rows])
+    values = {name: np.array([_value(row[k], best.decimal) for row in rows])
               for k, name in enumerate(best.names)}
     columns = [column_of(label, name, unit) for label, name, unit in zip(
         best.labels or [""] * len(best.names), best.names, best.units or [""] * len(best.names))]
-    _sketch_time(result, columns, values, {name: [row[k] for row in best.rows]
+    _sketch_time(result, columns, values, {name: [row[k] for row in rows]
                                            for k, name in enumerate(best.names)})
     if not best.labels:
         columns = _by_values(columns, values, result.content["time"].get("column"))
@@ -145,9 +146,23 @@ def _cut(line: str, delimiter: str) -> list[str]:
     return [cell.strip().strip('"').strip() for cell in cells]
 
 
+def _pointed(text: str, decimal: str) -> str:
+    return text.replace(",", ".") if decimal == "," else text
+
+
 def _value(text: str, decimal: str) -> float:
-    text = text.replace(",", ".") if decimal == "," else text
+    text = _pointed(text, decimal)
     return float(text) if is_number(text) else np.nan
+
+
+def _sound(layout: "_Layout") -> list[list[str]]:
+    """The rows without those that have no number where nearly all others have one."""
+    broken: set[int] = set()
+    for k in range(len(layout.names)):
+        none = [i for i, row in enumerate(layout.rows)
+                if row[k] and not is_number(_pointed(row[k], layout.decimal))]
+        broken |= set(none if len(none) <= BROKEN * len(layout.rows) else ())
+    return [row for i, row in enumerate(layout.rows) if i not in broken]
 
 
 def _layout(lines: list[str], delimiter: str, decimal: str) -> _Layout:
