@@ -40,7 +40,7 @@ _KNOT = 1852 / 3600
 _SOME_DAY = datetime.fromtimestamp(EPOCH / 1e9, UTC).date()
 _MOST_UNDATED = 200_000    # samples of a file that wait for a date: hours
 _UNDATED = "epochs of NMEA before a date came (RMC or ZDA)"
-# ESF-MEAS and ESF-RAW data types: gyroscope z, y, x in deg/s, accelerometer x, y, z in m/s^2.
+# ESF-MEAS and ESF-RAW data types: gyroscope x, y, z in deg/s, accelerometer x, y, z in m/s^2.
 _ESF = {14: ("gyr", 0, 2.0 ** -12 * math.pi / 180), 13: ("gyr", 1, 2.0 ** -12 * math.pi / 180),
         5: ("gyr", 2, 2.0 ** -12 * math.pi / 180), 16: ("acc", 0, 2.0 ** -10),
         17: ("acc", 1, 2.0 ** -10), 18: ("acc", 2, 2.0 ** -10)}

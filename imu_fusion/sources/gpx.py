@@ -5,6 +5,7 @@ Elevations are above sea level, as GPX has them; accuracies are not told.
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
@@ -21,7 +22,9 @@ class Gpx(Source):
     def __init__(self, strict: bool = True) -> None:
         super().__init__(strict)
         self._parser: Any = ElementTree.XMLPullParser(["end"])
-        self._part, self._seen, self._broken = "", 0, ""
+        self._part, self._seen = "", 0
+        self._broken = ""    # why the rest of the file cannot be read
+        self._bad = ""       # why the first of the points that cannot be read cannot
 
     def feed(self, data: bytes, part: str = "") -> list[Block]:
         self._part = part
@@ -29,10 +32,7 @@ class Gpx(Source):
             return []
         if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
             raise SampleError(f"{part}: declares entities, which no track needs")
-        try:
-            self._parser.feed(data)
-        except ElementTree.ParseError as error:    # what comes before it is kept
-            self._broken = f"is no GPX from some place on ({error})"
+        self._parser.feed(data)
         return self._points()
 
     def finish(self) -> list[Block]:
@@ -41,24 +41,38 @@ class Gpx(Source):
                 self._parser.close()
             except ElementTree.ParseError as error:
                 self._broken = f"ends in the middle ({error})"
-        blocks = [] if self._broken else self._points()
+        blocks = self._points()
         if not self._seen:
-            raise SampleError(f"{self._part}: "
-                              + (self._broken or "no track points with time and elevation"))
+            why = self._broken or "no track points with time and elevation"
+            raise SampleError(self._bad or f"{self._part}: {why}")
+        if self._bad:
+            self.remark(f"the first that cannot be read: {self._bad}")
         if self._broken:
             self.lost[f"part of the track, as {self._part} {self._broken}"] += 1
         return blocks
 
+    def _elements(self) -> Iterator[ElementTree.Element]:
+        """Those that are complete, up to where the file is none any more."""
+        try:
+            for _, element in self._parser.read_events():
+                yield element
+        except ElementTree.ParseError as error:
+            self._broken = self._broken or f"is no GPX from some place on ({error})"
+
     def _points(self) -> list[Block]:
         rows = []
-        for _, element in self._parser.read_events():
+        for element in self._elements():
             tag = element.tag.rpartition("}")[2]
             if tag == "trkpt":
                 texts = {child.tag.rpartition("}")[2]: child.text for child in element}
-                if texts.get("time") and texts.get("ele"):
-                    rows.append(self._row(element, texts))
-                else:
-                    self.lost["track points without time or elevation"] += 1
+                try:
+                    if texts.get("time") and texts.get("ele"):
+                        rows.append(self._row(element, texts))
+                    else:
+                        self.lost["track points without time or elevation"] += 1
+                except SampleError as error:
+                    self.lost["track points that cannot be read"] += 1
+                    self._bad = self._bad or str(error)
             if tag in ("trkpt", "trkseg"):
                 element.clear()
         if not rows:

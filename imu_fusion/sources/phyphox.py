@@ -79,13 +79,9 @@ class Phone:
     def remarks(self) -> list[str]:
         """What to say of the readings at the end."""
         there = [kind for kind in ("accelerometer", "gyroscope") if kind in self._seen]
-        return [text for applies, text in (
-            (len(there) == 1, f"{IMU_TOPIC} needs accelerometer and gyroscope; there is the "
-                              f"{''.join(there)} alone"),
-            (self.pairing.left_out, f"{self.pairing.left_out} rates without a force beside them "
-                                    "are left out"),
-            (self.pairing.repeated, f"{self.pairing.repeated} readings whose time does not rise "
-                                    "are left out")) if applies]
+        alone = [f"{IMU_TOPIC} needs accelerometer and gyroscope; there is the {there[0]} alone"
+                 ] if len(there) == 1 else []
+        return alone + self.pairing.remarks()
 
     def finish(self) -> list[Block]:
         """What waited for more."""
