@@ -74,8 +74,9 @@ class SourceStorage(Storage):
         for remark in source.remarks:
             mention(remark)
         if not found:
-            raise BagError("; ".join([f"{path}: {known.about if known else 'a table'}, without any "
-                                      "samples", *source.remarks]))
+            raise BagError("; ".join([
+                f"{path}: {known.about if known else 'a table'}, without any samples",
+                *(f"{count} {what}" for what, count in source.lost.items()), *source.remarks]))
         self._logs = {topic: _sorted(logs) for topic, logs in found.items()}
         for topic, log in self._logs.items():
             self.topics[topic] = StoredTopic(topic, msgtype_of(log), len(log), [qos_profile()])

@@ -259,8 +259,8 @@ def _excel(part: str, data: bytes):
         text = "\n".join("\t".join(str(cell).replace("\t", " ").replace("\n", " ") for cell in row)
                          for row in rows)
         reader = TableReader(TableParams(delimiter="tab"), f"{part}, sheet {name}")
-        found = reader.feed(text.encode() + b"\n")
-        if found.lines:
+        found = reader.whole(text.encode())
+        if reader.names:
             meta = {"Metadata Time": "time", "Metadata Device": "device"}.get(name, name)
             yield meta, _Sheet(f"{part}, sheet {name} (Excel files of phyphox are known, others "
                                "have to be saved as CSV)", reader, found)

@@ -19,6 +19,7 @@ from imu_fusion.sources.source import BROKEN, EPOCH, STANDARD_GRAVITY, decoded, 
 from imu_fusion.sources.times import NANOSECONDS, calendar, is_calendar
 
 _LINES = 3000           # that are looked at
+_COMMENT = "#"
 _FIELD = (15e-6, 80e-6)  # T, of the Earth, with room
 _GRAVITY = (0.85, 1.15)  # of standard gravity, of a sensor at rest
 _SINCE_START = 1e8      # s, three years: times below do not count from 1970
@@ -98,7 +99,7 @@ def sketch(data: bytes, where: str) -> Sketch:
              data.removeprefix(b"\xef\xbb\xbf").split(b"\n")[:_LINES]]
     if len(data) and not data.endswith(b"\n") and len(lines) > 2:
         lines.pop()    # perhaps cut in the middle
-    best = max((_layout(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "space")
+    best = max((_layout(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "|", "space")
                 for decimal in ".," if delimiter != decimal), key=lambda layout: layout.score)
     if best.score <= 0:
         raise SampleError(f"{where}: no rows of numbers are found; a table has a line for each "
@@ -106,8 +107,10 @@ def sketch(data: bytes, where: str) -> Sketch:
     rows = _sound(best)
     result = Sketch()
     delimiter = {"\t": "tab"}.get(best.delimiter, best.delimiter)
+    comment = _COMMENT if any(line.startswith(_COMMENT) for line in lines[best.first:]) else None
     for key, value, usual in (("delimiter", delimiter, ","), ("decimal", best.decimal, "."),
-                              ("skip_lines", best.skip, 0), ("header", best.header, True)):
+                              ("comment", comment, None), ("skip_lines", best.skip, 0),
+                              ("header", best.header, True)):
         if value != usual:
             result.content[key] = value
     values = {name: np.array([_value(row[k], best.decimal) for row in rows])
@@ -128,12 +131,13 @@ def sketch(data: bytes, where: str) -> Sketch:
 @dataclass
 class _Layout:
     """``names`` are those of the description; ``labels`` and ``units`` what stands above the
-    columns, empty where nothing does."""
+    columns, empty where nothing does; ``first`` the line of the first row."""
 
     score: float
     delimiter: str = ","
     decimal: str = "."
     skip: int = 0
+    first: int = 0
     header: bool = True
     names: list[str] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
@@ -177,7 +181,7 @@ def _layout(lines: list[str], delimiter: str, decimal: str) -> _Layout:
     first = body[0][0]
     above = [(k, cells) for k, cells in rows if k < first]
     score = float(sum(numeric[k] for k, _ in body)) / len(rows)
-    layout = _Layout(score, delimiter, decimal, rows=[cells for _, cells in body])
+    layout = _Layout(score, delimiter, decimal, first=first, rows=[cells for _, cells in body])
     _read_header(layout, above, width)
     if 2 * len(body) < len(rows) - (len(above) if layout.header else 0):
         return _Layout(0.0)
@@ -220,10 +224,10 @@ def _is_unit(text: str) -> bool:
 
 def _sketch_time(result, columns, values, texts):
     """The time column: by name or unit, else the first that rises throughout."""
-    dates = [c for c in columns if is_calendar(texts[c.name][0])]
-    if dates:
-        _sketch_dates(result, dates[0].name, texts[dates[0].name], values)
-        return
+    for column in columns:
+        if is_calendar(texts[column.name][0]) and _sketch_dates(
+                result, column.name, texts[column.name], values):
+            return
     turns = {c.name: _turn(values[c.name]) for c in columns}
     rising = [c for c in columns if turns[c.name] is not None]
     named_so = [c for c in columns if not c.kind and np.isfinite(values[c.name]).any() and (
@@ -267,17 +271,17 @@ def _sketch_time(result, columns, values, texts):
 
 
 def _sketch_dates(result, name, texts, values):
-    """Times that are written out; their seconds go to ``values``."""
-    result.content["time"] = {"column": name, "unit": "iso8601"}
+    """Whether the texts are times that are written out; their seconds go to ``values``."""
     try:
         since = np.array([calendar(text.strip()) for text in texts], dtype=np.int64)
     except ValueError:
-        result.doubts["time"] = "not all of them are times"
-        return
+        return False
+    result.content["time"] = {"column": name, "unit": "iso8601"}
     values[name] = (since - since[0]) / NANOSECONDS
     if since[0] < _SINCE_START * NANOSECONDS:
         result.content["time"]["start"] = EPOCH * 1e-9
         result.doubts["time"] = "hours without a date"
+    return True
 
 
 def _turn(values):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import zipfile
 
@@ -113,6 +114,12 @@ def test_nmea_waits_for_its_date_in_a_file_and_passes_midnight():
     live = Receiver(strict=False)
     assert list(read(live, data)["fix"].stamp / 1e9) == expected[2:]
     assert sum(live.lost.values()) == 2
+
+
+def test_sentences_without_checksums_are_known_and_told(tmp_path):
+    (tmp_path / "log.txt").write_bytes(re.sub(rb"\*..", b"", gga("120000.00") + gga("120001.00")))
+    with pytest.raises(ImuFusionError, match="2 sentences of NMEA whose checksum is wrong"):
+        open_bag(tmp_path / "log.txt")
 
 
 def test_nmea_without_any_date_is_of_some_day_and_says_so():
