@@ -33,7 +33,8 @@ def read_source(path: Path, source: Source) -> list[Block]:
         ImuFusionError: names the file, and the line or part that is wrong.
     """
     try:
-        blocks = [block for part, data in parts(path) for block in source.feed(data, part)]
+        blocks = [block for part, data in parts(path, lose=lambda text: source.lost.update([text]))
+                  for block in source.feed(data, part)]
         return [in_range(block, source) for block in blocks + source.finish()]
     except ImuFusionError:
         raise

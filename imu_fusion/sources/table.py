@@ -261,11 +261,11 @@ def _stamp(where: str, line: int, text: str, week: float, time: TimeParams) -> i
 
 
 class _Clock(NamedTuple):
-    """How the times of a table stand: number of rows, how often the counter of the times began
+    """How the times of a table stand: number of rows read, how often the counter of the times began
     anew and its last value, ns of the last row, how many times fell back, and line and ns of the
     first one that did."""
 
-    count: int = 0
+    rows: int = 0
     turns: int = 0
     last: int | None = None
     latest: int = 0
@@ -298,7 +298,7 @@ class TableSource(Source):
         if self._reader is not None:
             blocks = self._blocks(self._reader.finish())
             self._reader.account(self.lost, self.strict)
-        count, falls = self._clock.count, self._clock.falls
+        count, falls = self._clock.rows, self._clock.falls
         if self.strict and count < 2:
             raise SampleError(f"{self._where}: {count} rows of numbers; is skip_lines or header "
                               "right?")
@@ -378,7 +378,7 @@ class TableSource(Source):
         time, reader, clock = self._description.table.time, self._reader, self._clock
         assert reader is not None
         if time.rate is not None:
-            before = clock.count + reader.broken    # which had their times, too
+            before = clock.rows + reader.broken    # which had their times, too
             since = np.round((before + np.arange(len(rows.lines)))
                              * (NANOSECONDS / time.rate)).astype(np.int64)
             stamps = (since + round(time.start * NANOSECONDS)).tolist()
@@ -399,7 +399,7 @@ class TableSource(Source):
         if (back > 0).any() and not clock.falls:
             k = int(np.argmax(back > 0))
             fall = rows.lines[k], int(back[k])
-        return found, _Clock(clock.count + len(rows.lines), turns, last, stamps[-1],
+        return found, _Clock(clock.rows + len(rows.lines), turns, last, stamps[-1],
                              clock.falls + int((back > 0).sum()), fall)
 
     def _check(self, rows: Rows, stamps: list[int]) -> None:

@@ -1,5 +1,8 @@
 """Damaged exports: a broken line costs itself, and what is lost is said."""
 
+import io
+import zipfile
+
 import pytest
 import yaml
 from click.testing import CliRunner
@@ -108,6 +111,19 @@ def test_text_in_utf_16_is_read_as_any_other(tmp_path):
     (tmp_path / "u.csv").write_text(rows(9), encoding="utf-16-le")    # without its mark
     with pytest.raises(ImuFusionError, match="zeros"):
         open_bag(tmp_path / "u.csv", tmp_path / "d.yaml")
+
+
+def test_a_damaged_file_of_an_archive_costs_no_other(tmp_path):
+    data = bytearray(zipped(export()))
+    with zipfile.ZipFile(io.BytesIO(bytes(data))) as archive:
+        entry = archive.getinfo("walk/Magnetometer.csv")
+        at = entry.header_offset + 30 + len(entry.filename) + entry.compress_size // 2
+    (tmp_path / "whole.zip").write_bytes(data)
+    data[at:at + 4] = b"\xff" * 4
+    (tmp_path / "walk.zip").write_bytes(data)
+    with open_bag(tmp_path / "whole.zip") as whole, open_bag(tmp_path / "walk.zip") as reader:
+        assert reader.topics["/imu/data_raw"].count == whole.topics["/imu/data_raw"].count
+        assert any("walk/Magnetometer.csv" in text for text in reader.losses)
 
 
 def test_what_macos_leaves_beside_is_no_part_of_an_export(tmp_path):
