@@ -199,7 +199,8 @@ class AccelerationFieldStream(Stream):
         super().reset(session_topics)
 
     def restart(self) -> None:
-        self.estimator.reset()
+        # Where a clock was set the body may be in any motion.
+        self.estimator.reset(start_known=not self.restarts)
         self.matcher = self.config.make_matcher()
         self._rows: list[np.ndarray] = []
         self._asked = np.empty(0, np.int64)    # stamps of rows to come, with match.rows_of
