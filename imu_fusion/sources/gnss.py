@@ -8,7 +8,6 @@ pyubx2 and pynmeagps.
 
 import math
 import re
-import struct
 from collections import Counter
 from dataclasses import replace
 from datetime import UTC, date, datetime, time, timedelta
@@ -240,7 +239,7 @@ class Receiver(Source):
         if not whole:
             self.lost["frames of UBX that cannot be read"] += 1
             return []
-        ms, *words = struct.unpack(f"<{len(payload) // 4}I", payload)
+        ms, *words = np.frombuffer(payload, "<u4").tolist()
         blocks: list[Block] = []
         for k, (word, tag) in enumerate(zip(words[::2], words[1::2])):
             tag %= _TICKS
