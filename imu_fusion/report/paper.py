@@ -22,6 +22,7 @@ from imu_fusion.report.html import Figure, Section
 COLUMN_WIDTH = 3.5      # inches: 89 mm, a column of most journals
 _PANEL, _REST = 0.95, 0.65    # inches of height: of a panel over time, of legend and labels
 _POINTS = 6.5           # of the text
+_COLUMNS = 3            # of a legend
 _LINE = 0.6             # points of a line for each of plotly's pixels
 _STYLES = {"solid": "-", "dot": ":", "dash": "--", "dashdot": "-."}
 _SETTINGS: Any = {
@@ -109,8 +110,9 @@ def _draw_markers(canvas, panel, trace, places, label):
     """``places``: x, y and perhaps z, (n,) each."""
     marker = trace.marker
     of_speed = marker.color is not None and not isinstance(marker.color, str)
+    size = float(np.clip(600.0 / max(len(places[0]), 1), 1.5, 6.0))    # few are to be seen, too
     shown = panel.scatter(
-        *places, s=1.5, c=marker.color if marker.color is not None else trace.line.color,
+        *places, s=size, c=marker.color if marker.color is not None else trace.line.color,
         cmap="viridis" if of_speed else None, label=label, linewidths=0.0, rasterized=True,
         alpha=marker.opacity)
     if of_speed and marker.colorbar.title.text:
@@ -149,8 +151,11 @@ def _draw_legend(canvas, panels):
         for handle, label in zip(*panel.get_legend_handles_labels()):
             entries.setdefault(label, handle)
     if entries:
-        canvas.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=3,
-                      frameon=False, handlelength=1.4, columnspacing=1.0)
+        # Columns are filled one by one; read they are in rows.
+        order = [i for column in range(_COLUMNS) for i in range(column, len(entries), _COLUMNS)]
+        canvas.legend(*([kind[i] for i in order] for kind in (
+            list(entries.values()), list(entries))), loc="outside upper center", ncols=_COLUMNS,
+            frameon=False, handlelength=1.4, columnspacing=1.0, markerscale=2.0)
 
 
 def _draw_space(figure, traces):
@@ -168,7 +173,7 @@ def _draw_space(figure, traces):
             panel.plot(*places, color=colour, linewidth=0.8, label=label)
         elif "lines" in mode:
             shown = panel.scatter(*places, s=1.0, c=colour, cmap="viridis", label=label)
-            canvas.colorbar(shown, ax=panel, shrink=0.5, pad=0.12,
+            canvas.colorbar(shown, ax=panel, shrink=0.5, pad=0.2,
                             label=trace.line.colorbar.title.text)
         if mode.startswith("markers"):
             _draw_markers(canvas, panel, trace, places, label)
