@@ -6,6 +6,7 @@ once. What is read is what the sections use: lines, markers, filled bands, shade
 
 import html
 import re
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,10 @@ from imu_fusion.report.html import Figure, Section
 COLUMN_WIDTH = 3.5      # inches: 89 mm, a column of most journals
 _PANEL, _REST = 0.95, 0.65    # inches of height: of a panel over time, of legend and labels
 _POINTS = 6.5           # of the text
-_COLUMNS = 3            # of a legend
+_LETTERS, _HANDLE = 58, 5     # that a column is wide, and that stand for a line in a legend
 _LINE = 0.6             # points of a line for each of plotly's pixels
 _STYLES = {"solid": "-", "dot": ":", "dash": "--", "dashdot": "-."}
-_SETTINGS: Any = {
+SETTINGS: Any = {
     "font.size": _POINTS, "axes.linewidth": 0.5, "xtick.major.width": 0.5,
     "ytick.major.width": 0.5, "xtick.major.size": 2.0, "ytick.major.size": 2.0,
     "svg.fonttype": "none", "pdf.fonttype": 42, "text.parse_math": False, "savefig.dpi": 600}
@@ -54,7 +55,7 @@ def write_figures(sections: Sequence[Section], folder: str | Path, form: str = "
             stem = re.sub(r"[^a-z0-9]+", "_", section.title.lower()).strip("_")
             for number, figure in enumerate(figures, 1):
                 file = Path(folder) / f"{stem}{f'_{number}' if len(figures) > 1 else ''}.{form}"
-                with rc_context(_SETTINGS):
+                with rc_context(SETTINGS):
                     draw(figure).savefig(file)
                 written.append(file)
     except OSError as error:
@@ -151,11 +152,20 @@ def _draw_legend(canvas, panels):
         for handle, label in zip(*panel.get_legend_handles_labels()):
             entries.setdefault(label, handle)
     if entries:
+        columns = _legend_columns(list(entries))
         # Columns are filled one by one; read they are in rows.
-        order = [i for column in range(_COLUMNS) for i in range(column, len(entries), _COLUMNS)]
-        canvas.legend(*([kind[i] for i in order] for kind in (
-            list(entries.values()), list(entries))), loc="outside upper center", ncols=_COLUMNS,
-            frameon=False, handlelength=1.4, columnspacing=1.0, markerscale=2.0)
+        order = [i for column in range(columns) for i in range(column, len(entries), columns)]
+        labels = [textwrap.fill(label, _LETTERS - _HANDLE) for label in entries]
+        canvas.legend(*([kind[i] for i in order] for kind in (list(entries.values()), labels)),
+                      loc="outside upper center", ncols=columns, frameon=False, handlelength=1.4,
+                      columnspacing=1.0, markerscale=2.0)
+
+
+def _legend_columns(labels: list[str]) -> int:
+    """As many columns as stand beside each other."""
+    return next((columns for columns in (3, 2) if sum(
+        _HANDLE + max(map(len, labels[column::columns]), default=0)
+        for column in range(columns)) <= _LETTERS), 1)
 
 
 def _draw_space(figure, traces):
