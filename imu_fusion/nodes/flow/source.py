@@ -57,12 +57,12 @@ class Output:
         self.sent = self.start = self.bytes = 0
         self._flight = self._flight_bytes = 0
 
-    def publish(self, message: Any) -> None:
-        """Send a message (or its CDR bytes) now, or as soon as it may leave."""
-        if self.waiting or not self.is_open():
-            self.waiting.append(message)
-        else:
-            self._send(message)
+    def publish(self, *messages: Any) -> None:
+        """Send messages (or their CDR bytes) now, or as soon as they may leave."""
+        is_shut = bool(self.waiting)
+        self.waiting.extend(messages)
+        if not is_shut:
+            self.drain()
 
     def is_open(self) -> bool:
         """Whether a message would leave at once."""
