@@ -68,7 +68,7 @@ class Output:
         """Whether a message would leave at once."""
         if self._source.phase != _OPEN:
             return self._source.phase == _LIVE
-        if self._flight < WINDOW and self._flight_bytes < WINDOW_BYTES:
+        if self._has_room():
             return True
         taken = self._source.taken(self.topic)
         if taken is not None and (self.sent - taken) * self.bytes > QUEUED_BYTES * self.sent:
@@ -91,15 +91,25 @@ class Output:
 
     def drain(self) -> None:
         """Send what waits, as far as it may leave."""
+        handle, is_live = self._publisher.handle, self._source.phase == _LIVE
         while self.waiting and self.is_open():
-            self._send(self.waiting.popleft())
+            with handle:  # as Publisher.publish does, but once for many
+                self._send(handle, self.waiting.popleft())
+                while self.waiting and (is_live or self._has_room()):
+                    self._send(handle, self.waiting.popleft())
 
-    def _send(self, message):
-        self._publisher.publish(message)
-        self.sent += 1
-        if isinstance(message, bytes | memoryview):
+    def _has_room(self):
+        """Whether the window is not full."""
+        return self._flight < WINDOW and self._flight_bytes < WINDOW_BYTES
+
+    def _send(self, handle, message):
+        if isinstance(message, bytes):
+            handle.publish_raw(message)
             self._flight_bytes += len(message)
             self.bytes += len(message)
+        else:
+            handle.publish(message)
+        self.sent += 1
         self._flight += 1
 
 
@@ -170,9 +180,10 @@ class Source:
             self.advance()
 
     def ready(self) -> bool:
-        """Whether every topic may send (always, without a session)."""
-        return self.phase == _LIVE or not self._begin_after and all(
-            not output.waiting and output.is_open() for output in self.outputs.values())
+        """Whether more may be made: no topic has a window's worth waiting (without a session:
+        always). While the last window is acknowledged, the next one is made."""
+        return self.phase == _LIVE or (self.is_settled() and all(
+            len(output.waiting) < WINDOW for output in self.outputs.values()))
 
     def is_settled(self) -> bool:
         """Whether a session is open which all have joined."""
@@ -180,7 +191,8 @@ class Source:
 
     def is_shut(self) -> bool:
         """Whether something waits for acknowledgements, whose coming wakes nobody."""
-        return self.phase == _OPEN and (bool(self._event) or not self.ready())
+        return self.phase == _OPEN and (bool(self._event) or not all(
+            output.is_open() for output in self.outputs.values()))
 
     def drained(self) -> bool:
         """Whether no session is open: all who joined have everything."""
