@@ -42,7 +42,7 @@ INPUTS = {FIX_TOPIC: SAMPLE_TYPES[FIX.msgtype], MAG_TOPIC: SAMPLE_TYPES[MAG.msgt
 _NO_FIX = np.empty(0, np.int64), np.empty((0, 13))
 _NO_MAG = np.empty(0, np.int64), np.empty((0, 3))
 _NO_IMU = np.empty(0, np.int64), np.empty((0, 6))
-_FEW = 4    # samples that are handed over faster one by one
+_FEW = 24    # samples that are handed over faster one by one
 _CALIBRATION_INTERVAL = 50_000_000  # ns; turning sensors show a new direction about as often
 
 

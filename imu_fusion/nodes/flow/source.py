@@ -14,6 +14,8 @@ from imu_fusion.nodes.flow.peers import Peers
 from imu_fusion.nodes.flow.qos import (
     AT_ONCE,
     SILENT,
+    UNKNOWN_NODE,
+    Endpoints,
     full_name,
     gid,
     made,
@@ -28,7 +30,6 @@ QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
 SETTLING = 1.0  # s without anybody new, after which all who are there are taken to be known
 
-UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # as rmw calls it
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
 
@@ -133,6 +134,8 @@ class Source:
         self.foreign: dict[str, list[str]] = {}
         self.company: set[str] = set()  # instances that must have joined
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
+        self._subscriptions = Endpoints(self.node.count_subscribers,
+                                        self.node.get_subscriptions_info_by_topic)
         self._seen: set[str] = set()  # instances, and gids of readers that may be of others
         # When anybody new was seen last.
         self._news_at = float("-inf") if wait_for else time.monotonic()
@@ -344,10 +347,9 @@ class Source:
         seen = set() if self._wait_for or self.upstream else set(self.peers)
         self.foreign = {}
         for topic in self.outputs:
-            others = [info for info in self.node.get_subscriptions_info_by_topic(topic)
+            others = [info for info in self._subscriptions[topic]
                       if full_name(info) not in ours]
             seen |= set(map(gid, others))
-            # A node's endpoints are discovered before its name.
             names = {full_name(info) for info in others if info.node_name != UNKNOWN_NODE}
             if names:
                 self.foreign[topic] = sorted(names)
