@@ -30,7 +30,7 @@ from imu_fusion.estimation.acceleration_field.sensor_faults import FIT_UNITS
 from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
-from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
+from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_messages
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.parameters.file import ParamsFile, node_values, source_of
 from imu_fusion.samples import AccelerometerLog, ImuLog
@@ -175,11 +175,11 @@ def messages(config: FieldConfiguration, rows: np.ndarray) -> list[Messages]:
             [acceleration, rows["alpha"], cov.reshape(-1, 36)])))]
     points = np.reshape(config.field.points, (-1, 3))
     if len(points):
-        bodies = field_at(rows, points, gravity)[1]
-        magnitude = np.linalg.norm(bodies, axis=2)
-        made.append(Messages(POINTS_TOPIC, stamp, [
-            cloud_message(int(s), frame, _FIELDS, np.column_stack([points, body, size]))
-            for s, body, size in zip(stamp, bodies, magnitude)]))
+        body = field_at(rows, points, gravity)[1]
+        magnitude = np.linalg.norm(body, axis=2, keepdims=True)
+        places = np.broadcast_to(points, body.shape)
+        made.append(Messages(POINTS_TOPIC, stamp, cloud_messages(
+            stamp, frame, _FIELDS, np.concatenate([places, body, magnitude], axis=2))))
     return made
 
 
@@ -297,9 +297,11 @@ class AccelerationFieldStream(Stream):
         if not len(rows):
             return []
         self.residual_rms = float(rows["residual_rms"][-1])
-        self.saturated += int(np.sum(rows["flags"] & SATURATED > 0))
-        self.missing += int(np.sum(rows["flags"] & MISSING > 0))
-        self.left_out += int(np.sum(rows["flags"] & LEFT_OUT > 0))
+        flags = rows["flags"]
+        if flags.any():
+            self.saturated += int(np.count_nonzero(flags & SATURATED))
+            self.missing += int(np.count_nonzero(flags & MISSING))
+            self.left_out += int(np.count_nonzero(flags & LEFT_OUT))
         if self.concludes:
             self._rows.append(rows)
         return messages(self.config, rows)
