@@ -32,8 +32,9 @@ from imu_fusion.sensors.gyroscope_calibration import Turn, calibrate_gyroscope
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer
 from imu_fusion.simulation.avalanche import Avalanche, AvalancheParams
 from imu_fusion.simulation.ball_sensors import AVANODE, LEVER_ARM, RATE, BallErrors, record_ball
-from imu_fusion.streams.orientation import OrientationOutputParams
-from imu_fusion.streams.smoother import SmootherNodeParams, SmoothingParams, recovery_params
+from imu_fusion.streams.orientation_messages import OrientationOutputParams
+from imu_fusion.streams.smoother import recovery_params
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.surfaces.file import load_surface
 
