@@ -3,7 +3,9 @@
     python -m benchmarks.misfits [PART or SITUATION ...]
 
 Every row is a situation with known truth, simulated with 20 seeds. Says where an estimate is off by
-more than three stated standard deviations, in the mean over a run, and nothing was said.
+more than three stated standard deviations, in the mean over a run, and nothing was said. Without
+arguments, and as PART Smoother, the situations of :mod:`benchmarks.smoother_misfits` come, too, in
+their own table.
 """
 
 import sys
@@ -14,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import smoother_misfits
 from benchmarks.table import write_table
 from imu_fusion.errors import LayoutError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
@@ -373,6 +376,8 @@ def main(wanted: Sequence[str]) -> None:
                                    else "No row is wrong without a word.")))
     for text in silent:
         print(text)
+    if not wanted or "Smoother" in wanted:
+        smoother_misfits.main()
 
 
 if __name__ == "__main__":

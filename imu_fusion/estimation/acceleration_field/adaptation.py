@@ -66,17 +66,9 @@ def note(adaptation, kind, excess):
 
 
 @njit
-def adapt(adaptation, squares, contradiction, watched, innovation, last):
-    """Take one sample.
-
-    Args:
-        adaptation: ADAPTATION, changed.
-        watched: whether it was enough for the motion to be watched; else its innovations tell.
-        squares: mean of the squares of its innovations, in units of their variances.
-        contradiction: mean square of what no rigid motion explains, in units of the noise of the
-            parameters.
-        innovation: (m,) before any of them was used; last: (m,) that of the sample before; changed.
-    """
+def follow(adaptation, innovation, last):
+    """Keep whether innovations change their signs: of this sample (m,), before any was used, and of
+    the one before, ``last`` (m,), which becomes this."""
     product, square = 0.0, 0.0
     for c in range(len(innovation)):
         product += innovation[c] * last[c]
@@ -84,6 +76,19 @@ def adapt(adaptation, squares, contradiction, watched, innovation, last):
         last[c] = innovation[c]
     adaptation.product = _MEMORY * adaptation.product + product
     adaptation.square = _MEMORY * adaptation.square + square
+
+
+@njit
+def adapt(adaptation, squares, contradiction, watched):
+    """Take one sample, which was followed.
+
+    Args:
+        adaptation: ADAPTATION, changed.
+        squares: mean of the squares of its innovations, in units of their variances.
+        contradiction: mean square of what no rigid motion explains, in units of the noise of the
+            parameters.
+        watched: whether it was enough for the motion to be watched; else its innovations tell.
+    """
     if adaptation.grace > 0:
         adaptation.grace -= 1
         return
