@@ -48,7 +48,7 @@ def watch_motion(state, p, channels, reading, at, step, work):
         state.fitted[:] = False
         return
     values, variances = np.zeros(6), np.zeros(6)
-    _fit_readings(state, p, channels, reading, at, fit, values, variances)
+    _fit_readings(state, p, channels, reading, at, work, values, variances)
     tracked = adaptation.tracked
     goes_on = step.dt[0] > 0.0
     for c in range(len(channels)):
@@ -108,10 +108,10 @@ def _judge(state, p, step, values, variances):
 
 
 @njit
-def _fit_readings(state, p, channels, reading, at, fit, values, variances):
+def _fit_readings(state, p, channels, reading, at, work, values, variances):
     """The fit (6,) of a and alpha (times the radius) to the readings as they are, but for the
-    centripetal part, and the variances (6,) of its noise."""
-    w = at[OMEGA:OMEGA + 3]
+    centripetal part, and the variances (6,) of its noise and of that part."""
+    w, fit = at[OMEGA:OMEGA + 3], work.fit
     noisiness = factor(state.adaptation[0].noise)
     for c in range(len(channels)):
         if not fit.used[c]:
@@ -122,7 +122,7 @@ def _fit_readings(state, p, channels, reading, at, fit, values, variances):
         ur = u[0] * r[0] + u[1] * r[1] + u[2] * r[2]
         ww = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
         value = reading[c] - uw * rw + ur * ww
-        noise = noisiness * noise_variance(channels[c], p)
+        noise = noisiness * noise_variance(channels[c], p) + work.spun[c]
         for i in range(6):
             values[i] += fit.solve[i, c] * value
             variances[i] += fit.solve[i, c] * fit.solve[i, c] * noise
