@@ -7,6 +7,7 @@ import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.acceleration_field.motion_model import State
+from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 
 _SAMPLES = 10       # left out: fewer are single wild readings, without a cause to name
@@ -68,23 +69,43 @@ def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[Sens
     return found
 
 
-def fit_remarks(fits: list[SensorFit], state: State) -> list[str]:
+def coarse_remarks(names: list[str], array: SensorArray, params: AccelerationFieldParams,
+                   steps: np.ndarray) -> list[str]:
+    """Accelerometers whose readings change by nothing finer than ``steps`` (K, 3), so that rounding
+    alone is more than the noise that is stated. A step errs by its size / sqrt(12)."""
+    remarks = []
+    for k, name in enumerate(names):
+        density = float(array.channels["density"][array.channels["sensor"] == k][0])
+        stated = params.noise_scale * density * np.sqrt(params.sample_rate)
+        known = steps[k][np.isfinite(steps[k])]
+        if len(known) and known.max() > np.sqrt(12.0) * stated:
+            step = float(known.max())
+            needed = step / np.sqrt(12.0 * params.sample_rate)
+            remarks.append(
+                f"accelerometer '{name}' reads in steps of {step:.3g} m/s^2, whose rounding is more "
+                f"than its noise of {stated:.2g}: set accelerometers.{name}.noise_density to "
+                f"{needed:.2g} or more, and bias_sd to {step / np.sqrt(12.0):.2g} or more")
+    return remarks
+
+
+def fit_remarks(fits: list[SensorFit], state: State, has_gyro: bool) -> list[str]:
     """What is wrong with the sensors, single ones and as a whole, and what to do."""
+    or_gyro = ", or unit, axes and sign of the gyroscope" if has_gyro else ""
     remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
     moved = [fit.name for fit in fits if fit.mounting]
     if len(moved) > len(fits) / 2:
         # Of so many, what they have in common is more likely.
         remarks = [fit.fault for fit in fits if fit.fault] + [
             f"positions or axes of {len(moved)} of {len(fits)} accelerometers do not fit what is "
-            "described: check units and scale of the positions; or the motion is faster than the "
-            "sampling"]
+            f"described: check units and scale of the positions{or_gyro}; or the motion is faster "
+            "than the sampling"]
     doubted = int(state.checks["doubted"].max())
     if doubted >= _SAMPLES:
         remarks.append(
             f"the accelerometers contradict each other in {doubted} of "
             f"{state.checks['checked'].max()} samples, and no single one is to blame; these count "
             "for little: are two of them exchanged, or several positions, axes, units or ranges "
-            "wrong?")
+            f"wrong{or_gyro}?")
     adaptation = state.adaptation[0]
     noise, motion = (float(most) for most in adaptation["most"])
     if noise > _WIDER:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
@@ -108,7 +109,6 @@ def test_two_that_are_exchanged_are_not_passed_over(impact):
 
 def test_a_mounting_within_its_sd_is_found(impact):
     # 5 deg where 2 deg are expected: within what is plausible, so it is used and estimated.
-    from scipy.spatial.transform import Rotation
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(5.0)])
     readings = felt(impact)
     readings[:, 2] = turn.inv().apply(readings[:, 2])
@@ -135,6 +135,63 @@ def test_a_hard_impact_is_not_blamed_on_the_mounting(modulus, mode):
                                             np.linalg.inv(rows["cov_omega"][20:]), error)))
         assert np.abs(error).max() < 0.6 and estimator.remarks() == []
     assert np.mean(normalised) < 4
+
+
+def test_noise_that_alternates_does_not_hide_an_impact():
+    # Chance makes it so now and then; the fall ends with 135 g within 8 ms.
+    motion = simulate(ImpactScene(modulus=1e7, ground=0.6, velocity=(0.75, 0.0, -3.0), mass=4.5),
+                      duration=0.1, step=1e-5, every=100)
+    readings = motion.readings(PAPER_POSITIONS, PAPER_AXES)
+    sizes = np.abs(np.random.default_rng(4).normal(0.0, NOISE, readings.shape[1:]))
+    signs = np.where(np.arange(len(motion.t)) % 2 == 0, 1.0, -1.0)
+    estimator = AccelerationFieldEstimator(PARAMS, layout())
+    rows = estimator.run(motion.stamp, readings + signs[:, None, None] * sizes)
+    error = (rows["omega"] - motion.omega)[20:]
+    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_omega"][20:]),
+                             error)) < 4
+
+
+def test_a_blow_in_one_direction_is_as_wild_as_that():
+    # Twelve single axes at 2 kHz: five components that fit must not hide the sixth.
+    motion = simulate(ImpactScene(modulus=1e6, ground=0.6, velocity=(0.75, 0.0, -3.0), mass=4.5),
+                      duration=0.15, step=1e-5, every=50)
+    random = np.random.default_rng(0)
+    places = random.uniform(-0.12, 0.12, (12, 3))
+    axes = Rotation.random(12, random_state=0).as_matrix()
+    sensors = [AccelerometerParams(position=tuple(place), axes=tuple(own.ravel()), bias_sd=0.1,
+                                   measured_axes=("x",), noise_density=NOISE / 2000.0 ** 0.5)
+               for place, own in zip(places, axes)]
+    turned = (Rotation.from_rotvec(0.035 * random.standard_normal((12, 3)))
+              * Rotation.from_matrix(axes)).as_matrix()
+    readings = motion.readings(CENTRE + places + 1e-3 * random.standard_normal((12, 3)), turned)
+    readings += random.normal(0.0, NOISE, readings.shape)
+    rows = AccelerationFieldEstimator(PARAMS.replace(sample_rate=2000.0), sensors).run(
+        motion.stamp, readings)
+    error = (rows["omega"] - motion.omega)[20:]
+    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_omega"][20:]),
+                             error)) < 9
+
+
+def test_what_is_left_of_an_array_does_not_run_away(impact):
+    # Without the sensor that reads half of what it should, seven axes do not tell the rate.
+    readings = felt(impact)[::2]
+    readings[:, 1] *= 0.5
+    readings[:, 3, 1:] = np.nan
+    sensors = layout()
+    sensors["back"] = sensors["back"].replace(measured_axes=("x",))
+    estimator = AccelerationFieldEstimator(PARAMS.replace(sample_rate=500.0), sensors)
+    rows = estimator.run(impact.stamp[::2], readings)
+    assert all(np.isfinite(rows[name]).all() for name in ("quat", "omega", "cov_omega", "alpha"))
+    assert np.abs(rows["omega"]).max() < 200.0
+    assert any("accelerometer 'left' contradicts" in text for text in estimator.remarks())
+
+
+def test_steps_that_are_coarser_than_the_noise_are_told(impact):
+    fine, coarse = felt(impact), np.round(felt(impact) / 2.0) * 2.0
+    for readings, told in ((fine, False), (coarse, True)):
+        estimator = AccelerationFieldEstimator(PARAMS, layout())
+        estimator.run(impact.stamp, readings)
+        assert any("in steps of 2 m/s^2" in text for text in estimator.remarks()) is told
 
 
 @pytest.mark.parametrize("jitter", ["own", "common"])
