@@ -82,8 +82,8 @@ def coarse_remarks(names: list[str], array: SensorArray, params: AccelerationFie
             step = float(known.max())
             needed = step / np.sqrt(12.0 * params.sample_rate)
             remarks.append(
-                f"accelerometer '{name}' reads in steps of {step:.3g} m/s^2, whose rounding is more "
-                f"than its noise of {stated:.2g}: set accelerometers.{name}.noise_density to "
+                f"accelerometer '{name}' reads in steps of {step:.3g} m/s^2, whose rounding is "
+                f"more than its noise of {stated:.2g}: set accelerometers.{name}.noise_density to "
                 f"{needed:.2g} or more, and bias_sd to {step / np.sqrt(12.0):.2g} or more")
     return remarks
 
