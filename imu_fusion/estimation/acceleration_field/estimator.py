@@ -101,7 +101,7 @@ class AccelerationFieldEstimator:
                          "it states leaves their errors out; use rigid_body, or say that they are "
                          "(position_sd and axes_sd 0)")
         if self._judged is not None:
-            found += fit_remarks(self.sensor_fits(), self._judged, self.params.use_gyro)
+            found += fit_remarks(self.sensor_fits(), self.array, self._judged)
         found += coarse_remarks(self.names, self.array, self.params, self._limits.steps)
         unit = {"gyroscope": "rad/s"}
         for name, limits in self.limits_found.items():

@@ -63,17 +63,18 @@ def _mark(found, steps, ranges, accelerometers, readings):
         for k in range(len(found)):
             felt = k < accelerometers
             floor = _ACC_FLOOR if felt else _GYRO_FLOOR
+            if not np.isfinite(readings[n, k]).any():
+                continue    # lost: what comes next would seem to have jumped
             for i in range(3):
                 value = readings[n, k, i]
-                # An axis that is not measured, or has no value, is at no limit.
-                sample[i] = value if np.isfinite(value) else 0.0
                 last[i] = found[k].last[i]
-                if found[k].seen and sample[i] != last[i] and np.isfinite(value):
+                sample[i] = value if np.isfinite(value) else last[i]
+                if found[k].seen and sample[i] != last[i]:
                     steps[k, i] = min(steps[k, i], abs(sample[i] - last[i]))
             clipped = find_flat_tops(found[k], ranges[k], floor, felt, sample)
             for i in range(3):
                 size = abs(sample[i])
                 stands = (sample[i] == last[i] and size > floor and np.isnan(ranges[k, i])
                           and size >= found[k].largest[i])
-                if clipped >> i & 1 or stands:
+                if np.isfinite(readings[n, k, i]) and (clipped >> i & 1 or stands):
                     readings[n, k, i] = np.inf

@@ -14,7 +14,9 @@ _SAMPLES = 10       # left out: fewer are single wild readings, without a cause 
 _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave over
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
-_WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
+_UNLIKELY = 0.01    # chance of mountings that, taken together, are further off: worth a remark
+_NOISIER = 1.25     # times the sd of noise: worth a remark, as data that fit never change it
+_WIDER = 3.0        # times the sds of the motion's densities: the same
 _VAGUE = 0.1        # of the samples, in which the angular velocity may be hardly known
 _MOSTLY = 0.5       # of the samples: an impact is wilder than what is before and after it
 
@@ -88,10 +90,12 @@ def coarse_remarks(names: list[str], array: SensorArray, params: AccelerationFie
     return remarks
 
 
-def fit_remarks(fits: list[SensorFit], state: State, has_gyro: bool) -> list[str]:
+def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list[str]:
     """What is wrong with the sensors, single ones and as a whole, and what to do."""
-    or_gyro = ", or unit, axes and sign of the gyroscope" if has_gyro else ""
+    or_gyro = (", or unit, axes and sign of the gyroscope" if array.channels["is_gyro"].any()
+               else "")
     remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
+    remarks = remarks or _together(fits, array)
     moved = [fit.name for fit in fits if fit.mounting]
     if len(moved) > len(fits) / 2:
         # Of so many, what they have in common is more likely.
@@ -108,11 +112,12 @@ def fit_remarks(fits: list[SensorFit], state: State, has_gyro: bool) -> list[str
             f"wrong{or_gyro}?")
     adaptation = state.adaptation[0]
     noise, motion = (float(most) for most in adaptation["most"])
-    if noise > _WIDER:
+    if noise > _NOISIER and adaptation["samples"][0] >= _SAMPLES:
         remarks.append(
             f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
             f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
-            "jitter of the stamps, flexing, ringing or clipping, or raise noise_scale")
+            "jitter of the stamps, flexing, ringing, clipping or a scale that is off by a percent, "
+            "or raise noise_scale")
     checked = state.checks["checked"].max()
     if adaptation["vague"] > max(_SAMPLES, _VAGUE * checked):
         remarks.append(
@@ -126,6 +131,24 @@ def fit_remarks(fits: list[SensorFit], state: State, has_gyro: bool) -> list[str
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
             "motion.jerk_density and motion.acceleration_rate_density, or use maximum_likelihood")
     return remarks
+
+
+def _together(fits, array):
+    """A text on mountings none of which is far off, while all of them together are."""
+    squares, number = 0.0, 0
+    for k, fit in enumerate(fits):
+        own = array.channels[array.channels["sensor"] == k][0]
+        for error, sd in ((fit.position_error, own["position_sd"]),
+                          (fit.axes_error, own["axes_sd"])):
+            if np.isfinite(error).all():
+                squares += float(np.sum((error / sd) ** 2))
+                number += 3
+    if number == 0 or squares < scipy.special.chdtri(number, _UNLIKELY):
+        return []
+    return ["positions and axes of the accelerometers, taken together, fit best "
+            f"{np.sqrt(squares / number):.2g} times as far from what is described as their sds "
+            "say, so what is stated is too small: a sensor whose scale is off by a percent does "
+            "that; calibrate it, or raise sensor.acc_position_sd and sensor.acc_axes_sd"]
 
 
 def _states(state, first):
