@@ -22,6 +22,7 @@ from imu_fusion.report.contents import smoothed_of
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.trajectory_data import read_result
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.streams.acceleration_field import AccelerationFieldStream, read_configuration
 from imu_fusion.streams.orientation import OrientationStream
 from imu_fusion.streams.registry import STAGES
 from test.nodes.test_smoother import write as write_drive
@@ -254,3 +255,27 @@ def test_what_is_wrong_with_samples_is_said_at_every_door(name, tmp_path):
         assert all(any(word in text for text in found) for word in words), found
         assert words or not found
     assert by_info == set(by_process) and all(text in page for text in by_process)
+
+
+def test_accelerometers_in_g_are_told_at_every_door(tmp_path):
+    """Of an array whose axes point anywhere; that one of them hangs upside down is no remark."""
+    preset = ROOT / "config" / "head_four_accelerometers.yaml"
+    config = read_configuration(preset)
+    random = np.random.default_rng(0)
+    sent = {f"accelerometers/{name}": [
+        imu_message(5_000_000 * n, name, None,
+                    np.reshape(own.axes, (3, 3)) @ [0.0, 0.0, 1.0] + random.normal(0.0, 1e-3, 3))
+        for n in range(600)] for name, own in config.accelerometers.items()}
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic, cdrs in sent.items():
+            for n, cdr in enumerate(cdrs):
+                writer.write(f"/{topic}", IMU.msgtype, cdr, 5_000_000 * n)
+    with open_bag(tmp_path / "bag") as reader:
+        by_info = {f.text.lstrip("/") for t in inspect_topics(reader) for f in t.findings}
+    call("process", tmp_path / "bag", tmp_path / "out", "--params-file", preset)
+    by_process = json.loads((tmp_path / "out" / "results.json").read_text())["findings"]
+    stream = AccelerationFieldStream(config)
+    stream.take(sent)
+    for found in (by_info, by_process, stream.findings):
+        assert len(found) == 4 and all("which is gravity in g" in text for text in found)
+    assert by_info == set(by_process)

@@ -15,9 +15,9 @@ _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave o
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
 _UNLIKELY = 0.01    # chance of mountings that, taken together, are further off: worth a remark
-_NOISIER = 1.25     # times the sd of noise: worth a remark, as data that fit never change it
-_WIDER = 3.0        # times the sds of the motion's densities: the same
-_VAGUE = 0.1        # of the samples, in which the angular velocity may be hardly known
+_WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
+_NOISIER = 1.25     # as much for the noise, if it lasts: data that fit never change it
+_SHARE = 0.1        # of the samples, in which noise may be larger, or the rate hardly known
 _MOSTLY = 0.5       # of the samples: an impact is wilder than what is before and after it
 
 
@@ -103,29 +103,28 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
             f"positions or axes of {len(moved)} of {len(fits)} accelerometers do not fit what is "
             f"described: check units and scale of the positions{or_gyro}; or the motion is faster "
             "than the sampling"]
-    doubted = int(state.checks["doubted"].max())
+    doubted, checked = (int(state.checks[name].max()) for name in ("doubted", "checked"))
     if doubted >= _SAMPLES:
         remarks.append(
-            f"the accelerometers contradict each other in {doubted} of "
-            f"{state.checks['checked'].max()} samples, and no single one is to blame; these count "
-            "for little: are two of them exchanged, or several positions, axes, units or ranges "
-            f"wrong{or_gyro}?")
+            f"the accelerometers contradict each other in {doubted} of {checked} samples, and no "
+            "single one is to blame; these count for little: are two of them exchanged, or several "
+            f"positions, axes, units or ranges wrong{or_gyro}?")
     adaptation = state.adaptation[0]
     noise, motion = (float(most) for most in adaptation["most"])
-    if noise > _NOISIER and adaptation["samples"][0] >= _SAMPLES:
+    lasts = adaptation["samples"][0] > max(_SAMPLES, _SHARE * checked)
+    if noise > (_NOISIER if lasts else _WIDER):
         remarks.append(
             f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
             f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
             "jitter of the stamps, flexing, ringing, clipping or a scale that is off by a percent, "
             "or raise noise_scale")
-    checked = state.checks["checked"].max()
-    if adaptation["vague"] > max(_SAMPLES, _VAGUE * checked):
+    if adaptation["vague"] > max(_SAMPLES, _SHARE * checked):
         remarks.append(
             f"the angular velocity is hardly known in {adaptation['vague']} of {checked} samples: "
             "accelerometers tell its products alone, and by motion.jerk_density it may change by "
             "as much from sample to sample; lower that if it does not, sample faster, or add a "
             "gyroscope (use_gyro: true)")
-    if motion > _WIDER and adaptation["samples"][1] > _MOSTLY * state.checks["checked"].max():
+    if motion > _WIDER and adaptation["samples"][1] > _MOSTLY * checked:
         remarks.append(
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
