@@ -52,6 +52,14 @@ def test_a_broken_line_costs_itself(tmp_path, kind, damage):
     assert all(count - 2 <= after[topic] <= count for topic, count in before.items())
 
 
+def test_a_broken_time_of_an_experiment_is_told(tmp_path):
+    file = write_device("phyphox_time", tmp_path)
+    before, _ = counts(file)
+    file.write_bytes(file.read_bytes().replace(b'"PAUSE",.5E0', b'"PAUSE",.5X0'))
+    after, (said,) = counts(file)
+    assert after == before and f"{file}, line 3" in said
+
+
 def test_a_track_is_read_up_to_its_damage():
     whole = STREAMS["gpx"][1]
     for broken in (whole[:len(whole) * 3 // 4], whole.replace(b'lat="47.3"', b'lat="<47.3"')):
