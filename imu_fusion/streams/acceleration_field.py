@@ -30,8 +30,9 @@ from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_messages
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.parameters.file import ParamsFile, node_values, source_of
-from imu_fusion.samples import AccelerometerLog, ImuLog
+from imu_fusion.samples import AccelerometerLog, ImuLog, checks
 from imu_fusion.samples.blocks import Samples
+from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.matching import SampleMatcher
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
@@ -90,7 +91,8 @@ def _gyr_values(values):
 
 ACCELEROMETER = SampleType(IMU, 3, _acc_values, AccelerometerLog)
 GYROSCOPE = SampleType(IMU, 3, _gyr_values,
-                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, frame_id=frame))
+                       lambda stamp, gyr, frame: ImuLog(
+                           stamp, gyr, np.full_like(gyr, np.nan), frame))
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,20 @@ class FieldConfiguration:
         if self.field.use_gyro:
             inputs[GYROSCOPE_TOPIC] = GYROSCOPE
         return inputs
+
+    def findings(self, logs: Mapping[str, Any]) -> list[Finding]:
+        """What looks wrong with whole logs as recorded, by topic."""
+        found: list[Finding] = []
+        for topic, log in logs.items():
+            found += (checks.check_imu(log, topic) if topic == GYROSCOPE_TOPIC else
+                      checks.check_accelerometer(log, topic, self.feels_gravity))
+        return found
+
+    @property
+    def feels_gravity(self) -> bool:
+        """Whether the accelerometers, which all report the same, do."""
+        return self.field.gravity > 0.0 and all(
+            own.reports == "specific_force" for own in self.accelerometers.values())
 
     def make_estimator(self) -> AccelerationFieldEstimator:
         """The estimator of these parameters."""
@@ -244,6 +260,12 @@ class AccelerationFieldStream(Stream):
             self._rows = []
         return made
 
+    def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
+        if topic == GYROSCOPE_TOPIC or not self.config.feels_gravity:
+            return []
+        log = logs[topic]
+        return [found.text for found in checks.check_acceleration(log.acc, log.stamp, topic)]
+
     def conclude(self) -> Conclusion:
         """How the sensors fit, the greatest magnitudes, and the metrics of impacts if there are
         any."""
@@ -341,7 +363,8 @@ def _configure(stage, params_file):
     config = read_configuration(params_file)
     required = tuple(topic for topic in config.inputs if topic != GYROSCOPE_TOPIC)
     return replace(
-        stage, inputs=config.inputs, required=required, unusable="" if config.accelerometers else
+        stage, inputs=config.inputs, required=required, findings=config.findings,
+        unusable="" if config.accelerometers else
         "no accelerometers described; set accelerometers.names in a parameter file"), [config]
 
 
