@@ -1,11 +1,16 @@
 """When the sensor is at rest."""
 
+import math
+
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.kernels import njit
 
 REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_TURN = 1.5e-3       # rad/s per axis: slower turning than 0.5 deg/s passes as rest
 _SDS2 = 9.0               # squared standard deviations of the bias within which a mean rate is bias
+_FORCE_OFF = 0.05         # of gravity: by how much a force at rest can differ from it
+_SURE_TURN = 0.1          # rad, that the force would have turned by where a bias is refuted
+_STEEP = 2.0              # tan of the angle to the vertical within which a rate can be a turn
 
 
 @njit
@@ -27,7 +32,45 @@ def is_still(s, p):
         force2 += (step.force[i] - rest.mean_force[i]) ** 2
         mean2 += (rest.mean_rate[i] - s.gyro_bias[i]) ** 2
         limit2 += s.cov[es.GYRO_BIAS + i, es.GYRO_BIAS + i] + _REST_TURN ** 2
-    if (rate2 > p.fusion.rest_rate ** 2 or force2 > p.rest_force ** 2
-            or mean2 > _SDS2 * limit2):
+    enough = p.fusion.rest_time * 1e9
+    if rate2 > p.fusion.rest_rate ** 2 or force2 > p.rest_force ** 2:
+        rest.since = rest.changed = s.stamp
+        rest.settled = 0
+    elif mean2 <= _SDS2 * limit2:
+        rest.settled = 0
+    else:
         rest.since = s.stamp
-    return s.stamp - rest.since > p.fusion.rest_time * 1e9
+        if rest.settled == 0 and s.stamp - rest.changed > enough:
+            rest.settled = s.stamp
+            for i in range(3):
+                rest.settled_force[i] = rest.mean_force[i]
+    return s.stamp - rest.since > enough
+
+
+@njit
+def refuted_turn(s, p):
+    """Angle (rad) by which the sensor would have turned in a rest that the bias as known so far
+    takes for motion; 0 where there is none.
+
+    A force of gravity's size that stands still in imu axes points up. A body turns about it
+    unseen, as a vehicle in a circle does; any other turn would have moved it. So a mean rate that
+    points elsewhere is bias.
+    """
+    rest, bias = s.rest, s.gyro_bias
+    if not p.use_acc or rest.settled == 0:
+        return 0.0
+    force, before = rest.mean_force, rest.settled_force
+    size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if abs(size - s.gravity) > _FORCE_OFF * s.gravity:
+        return 0.0
+    along = across2 = moved2 = 0.0
+    for i in range(3):
+        rate = rest.mean_rate[i] - bias[i]
+        along += rate * force[i] / size
+        across2 += rate ** 2
+        moved2 += ((force[i] - before[i]) / size) ** 2
+    across2 -= along ** 2
+    turned = math.sqrt(max(across2, 0.0)) * (s.stamp - rest.settled) * 1e-9
+    if along ** 2 > _STEEP ** 2 * across2 or turned < _SURE_TURN + 3.0 * math.sqrt(moved2):
+        return 0.0
+    return turned
