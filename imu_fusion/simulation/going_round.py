@@ -17,7 +17,7 @@ _FADE = 4.0                            # s, in which a body gets going
 
 
 def waves(seed: int, lowest: float, highest: float, count: int = 5) -> "_Waves":
-    """Three sums of sines (n, 3) of unit variance, of frequencies in Hz, as a function of t (n,)."""
+    """Three sums of sines (n, 3) of unit variance, frequencies in Hz, as a function of t (n,)."""
     rng = np.random.default_rng(seed)
     return _Waves(2 * math.pi * rng.uniform(lowest, highest, (3, count)),
                   rng.uniform(0, 2 * math.pi, (3, count)), math.sqrt(2 / count))
@@ -66,7 +66,7 @@ class Circles(_Differences):
     """At rest, then circles at a steady rate, with some swaying.
 
     seed: of swaying and mounting. radius: m; rate: rad/s, positive to the left; leans: into the
-    circle as a scooter does, so that the force stays in its plane of symmetry, or level like a cart;
+    circle as a scooter does, so that the force stays in its plane of symmetry, or level as a cart;
     sway: rad per axis, .3 to 1.5 Hz; rest: s.
     """
 

@@ -45,7 +45,13 @@ from imu_fusion.estimation.orientation.rows import (
     write_attitude,
 )
 from imu_fusion.estimation.orientation.state import MAG_SUM
-from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_to_matrix,
+)
 from imu_fusion.kernels import njit
 
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed

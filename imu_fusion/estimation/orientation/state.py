@@ -45,6 +45,8 @@ REST = np.dtype([
     ("settled", "i8"),                   # stamp from which on neither has, and the mean rate is
                                          # no bias; 0 where it is otherwise
     ("settled_force", "f8", 3),          # mean_force at that stamp
+    ("settled_rate", "f8", 3),           # mean_rate, likewise
+    ("turn", "f8", 3),                   # rad, that the rates less their bias make since then
 ], align=True)
 """The rest detector (rest_detection)."""
 

@@ -60,7 +60,7 @@ def test_sample_by_sample_it_is_the_same(coming_to_rest):
 
 
 def _steady(rate, force_of):
-    """60 s at 100 Hz, after 5 s of rest a steady rate (3,); force_of: turned (n, 3) rad to (n, 3)."""
+    """At 100 Hz, 60 s of a steady rate (3,) after 5 s of rest; force_of: turns (n, 3) to (n, 3)."""
     time = np.arange(0.0, 65.0, 0.01)
     moving = np.clip(time - 5.0, 0.0, None)[:, None] * rate
     rng = np.random.default_rng(0)
