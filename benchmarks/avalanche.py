@@ -29,8 +29,9 @@ from imu_fusion.samples.logs import FixLog
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer
 from imu_fusion.simulation.avalanche import Avalanche
 from imu_fusion.simulation.ball_sensors import LEVER_ARM, BallErrors, record_ball
-from imu_fusion.streams.orientation import OrientationOutputParams
-from imu_fusion.streams.smoother import SmootherNodeParams, SmoothingParams, recovery_params
+from imu_fusion.streams.orientation_messages import OrientationOutputParams
+from imu_fusion.streams.smoother import recovery_params
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.surfaces.file import load_surface
 

@@ -33,7 +33,8 @@ from imu_fusion.simulation.rigid_body_impact import (
 )
 from imu_fusion.simulation.rigid_body_impact import simulate as simulate_impact
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
-from imu_fusion.streams.orientation import IMU_TOPIC, MAG_TOPIC, findings
+from imu_fusion.streams.orientation import findings
+from imu_fusion.streams.stream import IMU_TOPIC, MAG_TOPIC
 
 SEEDS = 20
 # Samples of the field that are not judged: its first ones know nothing of the acceleration.

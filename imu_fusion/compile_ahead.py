@@ -45,12 +45,10 @@ def _orientation() -> None:
 
 def _orientation_messages(imu, mag) -> None:
     """What turns rows into messages."""
+    from imu_fusion.estimation.orientation.params import OrientationParams
     from imu_fusion.messages.convert import imu_message, mag_message
-    from imu_fusion.streams.orientation import (
-        OrientationOutputParams,
-        OrientationParams,
-        OrientationStream,
-    )
+    from imu_fusion.streams.orientation import OrientationStream
+    from imu_fusion.streams.orientation_messages import OrientationOutputParams
 
     stream = OrientationStream(OrientationParams(),
                                OrientationOutputParams(remove_gravity_vector=True))

@@ -19,7 +19,8 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.simulation.ball_sensors import EPOCH
-from imu_fusion.streams.smoother import SmootherNodeParams, SmootherStream, SmoothingParams
+from imu_fusion.streams.smoother import SmootherStream
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 
 OFFSET = np.array([12e-6, -20e-6, 8e-6])
 SOFT = np.array([[1.05, 0.02, 0.0], [0.02, 0.96, -0.01], [0.0, -0.01, 1.01]])

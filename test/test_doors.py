@@ -177,6 +177,27 @@ IN_SPACE = {"nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped", "sensor_msgs/m
             "geometry_msgs/msg/PoseWithCovarianceStamped"}
 
 
+# Keys of panels, as those of Foxglove Studio's open successor say (Lichtblick, PlotConfig,
+# RendererConfig and the map's Config); what they do not know they ignore without a word.
+PANEL_KEYS = {
+    "3D": {"followMode", "followTf", "cameraState", "scene", "topics", "transforms"},
+    "map": {"layer", "followTopic", "disabledTopics", "topicColors", "center", "zoomLevel"},
+    "Plot": {"foxglovePanelTitle", "paths", "showLegend", "isSynced", "xAxisVal", "minYValue",
+             "maxYValue", "yAxisLabel"}}
+
+
+def test_the_layout_for_foxglove_says_nothing_that_its_panels_ignore():
+    panels = json.loads((ROOT / "config" / "foxglove.json").read_text())["configById"]
+    for name, panel in panels.items():
+        assert panel.keys() <= PANEL_KEYS[name.partition("!")[0]], name
+        for path in panel.get("paths", ()):
+            assert path.keys() <= {"value", "enabled", "timestampMethod", "label", "color"}, path
+            assert path["timestampMethod"] in ("headerStamp", "receiveTime")
+    assert panels["3D!space"]["followMode"] in ("follow-pose", "follow-position", "follow-none")
+    assert any(topic["visible"] for topic in panels["3D!space"]["topics"].values())
+    assert panels["map!places"]["layer"] in ("map", "satellite", "custom")
+
+
 def test_the_layout_for_foxglove_plots_fields_that_its_messages_have():
     panels = json.loads((ROOT / "config" / "foxglove.json").read_text())["configById"]
     types = {f"/{topic}": msgtype for stage in STAGES.values()

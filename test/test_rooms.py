@@ -85,7 +85,8 @@ COMPUTING_OF_FILES = {
     # Formats take bytes that others have read, and some know a library for what is in them.
     **{f"sources/{name}.py": extra for name, extra in {
         "source": {"re"}, "table": {"csv", "decimal"}, "times": {"decimal", "re"}, "header": {"re"},
-        "sketch": {"re"}, "registry": {"pathlib", "re"}, "avanode": {"re"},
+        "sketch": {"re"}, "table_layout": {"re"}, "table_time": {"re"},
+        "registry": {"pathlib", "re"}, "avanode": {"re"},
         "sensor_logger": {"csv", "json", "pathlib"}, "ximu3": {"pathlib", "struct"},
         "ulog": {"io", "pyulog"},
         "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib", "zipfile"},

@@ -26,10 +26,11 @@ from imu_fusion.estimation.acceleration_field.rows import (
     SATURATED,
     field_at,
 )
+from imu_fusion.estimation.acceleration_field.sensor_faults import FIT_UNITS
 from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
-from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
+from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_messages
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.parameters.file import ParamsFile, node_values, source_of
 from imu_fusion.samples import AccelerometerLog, ImuLog
@@ -174,11 +175,11 @@ def messages(config: FieldConfiguration, rows: np.ndarray) -> list[Messages]:
             [acceleration, rows["alpha"], cov.reshape(-1, 36)])))]
     points = np.reshape(config.field.points, (-1, 3))
     if len(points):
-        bodies = field_at(rows, points, gravity)[1]
-        magnitude = np.linalg.norm(bodies, axis=2)
-        made.append(Messages(POINTS_TOPIC, stamp, [
-            cloud_message(int(s), frame, _FIELDS, np.column_stack([points, body, size]))
-            for s, body, size in zip(stamp, bodies, magnitude)]))
+        body = field_at(rows, points, gravity)[1]
+        magnitude = np.linalg.norm(body, axis=2, keepdims=True)
+        places = np.broadcast_to(points, body.shape)
+        made.append(Messages(POINTS_TOPIC, stamp, cloud_messages(
+            stamp, frame, _FIELDS, np.concatenate([places, body, magnitude], axis=2))))
     return made
 
 
@@ -198,7 +199,8 @@ class AccelerationFieldStream(Stream):
         super().reset(session_topics)
 
     def restart(self) -> None:
-        self.estimator.reset()
+        # Where a clock was set the body may be in any motion.
+        self.estimator.reset(start_known=not self.restarts)
         self.matcher = self.config.make_matcher()
         self._rows: list[np.ndarray] = []
         self._asked = np.empty(0, np.int64)    # stamps of rows to come, with match.rows_of
@@ -233,12 +235,14 @@ class AccelerationFieldStream(Stream):
         any."""
         results: dict[str, Any] = {}
         fits = self.estimator.sensor_fits()
+        if fits or self._peaks:
+            results["units"] = UNITS | FIT_UNITS
         if fits:
             results["accelerometers"] = {fit.name: fit.numbers() for fit in fits}
         impact, remarks, summary = self.config.stream.impact, self.remarks(), ""
         if self._peaks:
             peaks = max(self._peaks, key=lambda found: max(found["peak_linear_acceleration"]))
-            results["units"], results["peaks"] = UNITS, peaks
+            results["peaks"] = peaks
             first = peaks["peak_linear_acceleration"][0]
             if impact.detect and not self._impacts:
                 remarks.append("no impact was measured: the linear acceleration at the first "
@@ -293,9 +297,11 @@ class AccelerationFieldStream(Stream):
         if not len(rows):
             return []
         self.residual_rms = float(rows["residual_rms"][-1])
-        self.saturated += int(np.sum(rows["flags"] & SATURATED > 0))
-        self.missing += int(np.sum(rows["flags"] & MISSING > 0))
-        self.left_out += int(np.sum(rows["flags"] & LEFT_OUT > 0))
+        flags = rows["flags"]
+        if flags.any():
+            self.saturated += int(np.count_nonzero(flags & SATURATED))
+            self.missing += int(np.count_nonzero(flags & MISSING))
+            self.left_out += int(np.count_nonzero(flags & LEFT_OUT))
         if self.concludes:
             self._rows.append(rows)
         return messages(self.config, rows)

@@ -15,7 +15,7 @@ from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.avalanche import slope_of, slope_section
 from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.smoother import Smoothed
-from imu_fusion.streams.smoother import SmootherNodeParams, SmoothingParams
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 from imu_fusion.surfaces.file import load_surface
 from test.report.test_report import Page
 

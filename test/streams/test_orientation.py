@@ -9,13 +9,9 @@ from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
 from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE
 from imu_fusion.messages.typestore import TYPES
-from imu_fusion.streams.orientation import (
-    IMU_TOPIC,
-    MAG_TOPIC,
-    ORIENTATION_TOPIC,
-    OrientationOutputParams,
-    OrientationStream,
-)
+from imu_fusion.streams.orientation import OrientationStream
+from imu_fusion.streams.orientation_messages import ORIENTATION_TOPIC, OrientationOutputParams
+from imu_fusion.streams.stream import IMU_TOPIC, MAG_TOPIC
 
 
 @pytest.mark.parametrize("values", [{}, {"method": "gyro_mag"},
@@ -55,6 +51,17 @@ def test_transforms_are_the_published_orientations_from_the_fixed_frame():
         assert found.header.stamp.sec * NANOSECONDS + found.header.stamp.nanosec == stamp
         turn = found.transform.rotation
         assert [turn.x, turn.y, turn.z, turn.w] == values[IMU["orientation"]].tolist()
+
+
+def test_all_numbers_of_a_result_have_units():
+    stream = OrientationStream()
+    stamps = 10_000_000 * np.arange(200)
+    force = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (200, 1))
+    stream.use({IMU_TOPIC: (stamps, force), MAG_TOPIC: (stamps, np.tile([0.0, 2e-5, -4e-5],
+                                                                        (200, 1)))})
+    results = stream.conclude().results
+    numbers = {name for name, value in results.items() if isinstance(value, float)}
+    assert results["aligned"] and len(numbers) > 20 and numbers <= set(results["units"])
 
 
 def test_there_is_no_heading_to_set_before_the_first_row():

@@ -18,7 +18,8 @@ from imu_fusion.parameters.file import parameters_for
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer
 from imu_fusion.simulation.avalanche import Avalanche
 from imu_fusion.simulation.ball_sensors import LEVER_ARM, BallErrors, record_ball
-from imu_fusion.streams.smoother import SmootherNodeParams, SmoothingParams, recovery_params
+from imu_fusion.streams.smoother import recovery_params
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 from imu_fusion.surfaces.file import load_surface
 from test.documents import ROOT
 
