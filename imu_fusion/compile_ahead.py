@@ -78,7 +78,7 @@ def _smoother() -> None:
 
 def _acceleration_field() -> None:
     from imu_fusion.geometry.rotation_arrays import rotation_matrices
-    from imu_fusion.streams.acceleration_field import FieldConfiguration
+    from imu_fusion.streams.acceleration_field import FieldConfiguration, messages
 
     imu, _ = _logs()
     places = {"a": [0.1, 0.0, 0.0], "b": [0.0, 0.1, 0.0], "c": [0.0, 0.0, 0.1],
@@ -91,7 +91,9 @@ def _acceleration_field() -> None:
                         ({"use_gyro": True}, imu.gyr)):
         config = FieldConfiguration.from_mapping(array | values)
         estimator = config.make_estimator()
-        rotation_matrices(estimator.run(imu.stamp, readings, gyr)["quat"])
+        rows = estimator.run(imu.stamp, readings, gyr)
+        rotation_matrices(rows["quat"])
+        messages(config, rows)
         if values.get("mode") != "smoothed":
             estimator.reset()
             for i in range(_SAMPLES):

@@ -86,7 +86,7 @@ class Layout:
             ("doubles", "d", (position - len(before),), slice(len(before), position)),
             *((f"after{k}", code, (), position + k) for k, code in enumerate(after))]
         self._latest: _Shape | None = None
-        self._shapes: dict[tuple[int, bytes, bytes], _Shape] = {}
+        self._shapes: list[_Shape] = []
         self._templates: dict[tuple[str, str], tuple[bytes, np.dtype]] = {}
 
     def __getitem__(self, field: str) -> slice:
@@ -191,6 +191,9 @@ class Layout:
 
     def _shape(self, cdr: bytes) -> _Shape:
         """The shape of a message, or MessageError."""
+        for shape in self._shapes:
+            if shape.fits(cdr):
+                return shape
         if len(cdr) < 16 or cdr[0] != 0 or cdr[1] not in (0, 1):
             raise MessageError(f"{self.msgtype}: {len(cdr)} bytes that do not start as plain CDR")
         order = "<" if cdr[1] == 1 else ">"
@@ -201,14 +204,11 @@ class Layout:
         if self.child and _aligned(end, 4) + 4 <= len(cdr):
             start = _aligned(end, 4)
             end = start + 4 + struct.unpack_from(order + "I", cdr, start)[0]
-        key = (len(cdr), cdr[:2], cdr[_STRINGS:end])
-        shape = self._shapes.get(key)
-        if shape is None:
-            record = self._record(order, end, len(cdr))
-            shape = _Shape(*key, end, cdr[16:first - 1].decode("utf-8", "replace"),
-                           struct.Struct(order + "iI"), record)
-            if len(self._shapes) < _KNOWN:
-                self._shapes[key] = shape
+        shape = _Shape(len(cdr), cdr[:2], cdr[_STRINGS:end], end,
+                       cdr[16:first - 1].decode("utf-8", "replace"), struct.Struct(order + "iI"),
+                       self._record(order, end, len(cdr)))
+        if len(self._shapes) < _KNOWN:
+            self._shapes.append(shape)
         return shape
 
     def _record(self, order: str, end: int, size: int | None = None) -> np.dtype:

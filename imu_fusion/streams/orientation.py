@@ -12,6 +12,7 @@ from imu_fusion.estimation.orientation.estimator import (
     OrientationEstimator,
     OrientationParams,
 )
+from imu_fusion.estimation.orientation.lost_turn import LOST, unseen_turn
 from imu_fusion.estimation.orientation.mag_screen import MagScreen
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
@@ -127,11 +128,14 @@ class OrientationStream(Stream):
         self._writer.restart()
         self._knows_north = False
         self._has_force = False
+        self._last_imu: int | None = None
+        self._said_lost = False
         self._kept: list[tuple[Samples, Samples]] = []
 
     def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         imu = samples.get(IMU_TOPIC, _NO_IMU)
         mag = samples.get(MAG_TOPIC, _NO_MAG)
+        self._look_for_gaps(imu[0])
         # What is published from the first fix on refers to true north.
         stamp, turn = self._first_north(*samples.get(FIX_TOPIC, _NO_FIX))
         if self.params.mode == "smoothed":
@@ -145,6 +149,21 @@ class OrientationStream(Stream):
             imu, mag = ((s[k:], v[k:]) for (s, v), k in zip((imu, mag), before))
             self._writer.turn += turn
         return made + self._run(imu, mag)
+
+    def _look_for_gaps(self, stamps):
+        """Say once that the body may have turned by more than linear errors describe in a gap."""
+        if not len(stamps) or self._said_lost:
+            return
+        first = stamps[0] if self._last_imu is None else self._last_imu
+        longest = float(np.diff(stamps, prepend=first).max()) * 1e-9
+        self._last_imu = int(stamps[-1])
+        turn = unseen_turn(self.params, longest)
+        if turn > LOST and not self.params.fusion.use_acc:
+            self._said_lost = True
+            self.warn(f"{IMU_TOPIC}: nothing for {longest:.2f} s, in which the body may have "
+                      f"turned by {turn:.1f} rad (gap.rate_sd): from there on only the direction "
+                      "of the field is known of its orientation, and nothing of the turn about "
+                      "it. The smoother knows more, where there are fixes or a surface")
 
     def flush(self) -> list[Messages]:
         made: list[Messages] = []

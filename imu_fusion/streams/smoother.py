@@ -167,10 +167,12 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
 
 def recovery_params(params: SmootherParams) -> OrientationParams:
     """Parameters of the orientation estimator that recovers rates for the smoother: its sensor, and
-    a body in free fall and under blows, whose force says nothing of gravity."""
-    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_range", "mag_offset", "mag_matrix")
+    a body in free fall and under blows, whose force says nothing of gravity and whose spin has
+    inertia."""
+    shared = ("gyro_noise_density", "gyro_bias_sd", "gyro_scale_sd", "gyro_range", "mag_offset",
+              "mag_matrix")
     return OrientationParams().replace(**{
-        "fusion.use_acc": False,
+        "fusion.use_acc": False, "fusion.angular_acc_sd": 100.0, "fusion.angular_acc_time": 0.1,
         **{f"sensor.{name}": getattr(params.sensor, name) for name in shared}})
 
 

@@ -18,7 +18,7 @@ from imu_fusion.nodes.flow.state import BEGIN, END, NEXT, Joined, Sending, Taken
 
 AT_ONCE = 2000  # messages of one topic that are taken in one turn
 # s, in which a block grows: in a session; live, for what was sent together; where nobody waits.
-NAP, NAP_LIVE, NAP_PATIENT = 0.002, 0.0003, 0.02
+NAP, NAP_LIVE, NAP_PATIENT = 0.002, 0.001, 0.02
 SHARED = ("/tf", "/tf_static")  # topics on which others' messages are no fault
 SILENCE = 5.0  # s, after which what is missing at the end counts as lost
 REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
