@@ -18,6 +18,7 @@ from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
+from imu_fusion.estimation.smoother.whiteness import correlation
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
@@ -30,9 +31,11 @@ _MAD = 1.4826        # standard deviations of a normal distribution in a median 
 
 def fits(result: SmootherResult) -> bool:
     """Whether innovations of the receiver are white and no larger than they should be. Smaller
-    ones are no reason: what is stated then is too cautious, and not wrong. A magnetometer's are
-    none: iron is no noise."""
+    ones are no reason, if they are white: what is stated then is too cautious, and not wrong. A
+    magnetometer's are none: iron is no noise."""
     return (all(excess == 1.0 for name, excess in result.wander.items() if name != "mag")
+            and not any(len(values) >= _FEWEST and correlation(values)
+                        for name, (_, values) in result.innovations.items() if name != "mag")
             and all(size < _LARGE or len(result.innovations[name][0]) < _FEWEST
                     for name, size in result.misfit().items() if name != "mag"))
 
