@@ -18,13 +18,14 @@ from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
-from imu_fusion.estimation.smoother.whiteness import correlation
+from imu_fusion.estimation.smoother.whiteness import correlation, wandering
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
 _SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
 _MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
@@ -56,6 +57,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     found, model = _deep_landing(found, model, smooth)
     if contradicted(found.result):
         return found.result
+    if model.params.maximum_likelihood != "off":
+        found, model = _bent_field(found, model, smooth)
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
     scatter = max(1.0, found.result.misfit().get("fix", 1.0))
     for other in _steps(found.result, model, scatter):
@@ -103,6 +106,38 @@ def _deep_landing(found, model, smooth):
     better = is_doubtful(found.result) or (lands and tried.result.surface["landing"].first_excess
                                            < fit.first_excess)
     return (tried, other) if lands and better else (found, model)
+
+
+def _bent_field(found, model, smooth):
+    """With a magnetometer that counts as much less as the field wanders; not compared by
+    likelihood, which has no name for iron.
+
+    Along the field no attitude shows, so what wanders there is the field.
+    """
+    for _ in range(_FIELD_TRIES):
+        excess = _field_wanders(found)
+        if excess == 1.0:
+            break
+        other = model._replace(noise={**model.noise, "mag": excess * model.noise.get("mag", 1.0)})
+        try:
+            found, model = smooth(other), other
+        except EstimationError:
+            break
+    return found, model
+
+
+def _field_wanders(found):
+    """How much more the residuals along the field wander than white noise does."""
+    readings = found.problem.readings
+    mag = readings[readings["kind"] == KINDS["mag"]]
+    if not len(mag):
+        return 1.0
+    left = found.result.residuals["mag"]
+    # Not along what was read: noise has made that longer.
+    field = mag["value"] - np.linalg.solve(mag["whiten"], left[:, :, None])[:, :, 0]
+    field /= np.linalg.norm(field, axis=1, keepdims=True)
+    along = np.sum(left * field, axis=1, keepdims=True)
+    return wandering(mag["stamp"], along)
 
 
 def _delays(found, model):

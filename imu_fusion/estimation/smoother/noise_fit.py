@@ -87,6 +87,6 @@ def _with(model: Model, factors: NoiseFactors) -> Model:
         sd = np.broadcast_to(model.params.get(f"{parameter}_sd"), 3)
         changes[f"{parameter}_sd"] = tuple((np.sqrt(walk * tau) * sd).tolist())
         changes[f"{parameter}_tau"] = float(tau) * model.params.get(f"{parameter}_tau")
-    return model.changed(changes)._replace(noise={
+    return model.changed(changes)._replace(noise={**model.noise, **{
         name: float(factor) * model.noise.get(name, 1.0)
-        for name, factor in factors.receiver.items()})
+        for name, factor in factors.receiver.items()}})
