@@ -119,7 +119,7 @@ def pipeline(bag: str, out: str, params_file: tuple[str, ...], without: tuple[st
     the same as those of `process`.
     """
     from imu_fusion.nodes.pipeline import run_pipeline
-    run_pipeline(bag, out, params_file, without, remap, overwrite)
+    run_pipeline(bag, out, params_file, without, remap, overwrite, warn=lambda text: warn([text]))
     click.echo(f"written: {out}")
     if with_report:
         _write_report(bag, out, Path(out) / "report.html", params_file, remap)

@@ -5,7 +5,7 @@
 Each node is a process of an own ROS domain. The estimates are those of ``batch.process``.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,11 +36,13 @@ class Plan:
             those of the recording.
         renamed: topics that are played under other names than those in the recording, to these.
         outdated: topics of the recording with earlier estimates, which are not played.
+        warnings: texts on what is wrong with the recording.
     """
 
     inputs: Mapping[Stage, Mapping[str, str]]
     renamed: Mapping[str, str]
     outdated: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @property
     def estimators(self) -> list[str]:
@@ -83,13 +85,13 @@ def plan_pipeline(bag: str | Path, params_file: ParamsFile = None,
             inputs[stage] = names
             made |= stage.outputs.keys()
         outdated = tuple(name for name in reader.topics if name.lstrip("/") in made)
-        return Plan(inputs, dict(reader.recorded), outdated)
+        return Plan(inputs, dict(reader.recorded), outdated, tuple(reader.warnings))
 
 
 def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = None,
                  without: Collection[str] = (), remap: Mapping[str, str] | None = None,
-                 overwrite: bool = False, logs: str | Path | None = None,
-                 show: bool = True) -> int:
+                 overwrite: bool = False, logs: str | Path | None = None, show: bool = True,
+                 warn: Callable[[str], object] = lambda text: None) -> int:
     """Replay a recording through the estimators into a new recording.
 
     Args:
@@ -103,6 +105,7 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = Non
         overwrite: replace ``out``.
         logs: directory for what the nodes print; a temporary one if None.
         show: let replayer and smoother print here.
+        warn: called with texts on what is wrong with the recording.
 
     Returns:
         ROS domain id that was used.
@@ -112,6 +115,8 @@ def run_pipeline(bag: str | Path, out: str | Path, params_file: ParamsFile = Non
     """
     refuse_source(bag, out)
     plan = plan_pipeline(bag, params_file, without, remap)
+    for text in plan.warnings:
+        warn(text)
     files = [Path(file).absolute() for file in files_of(params_file)]
     with NodeProcesses(logs) as nodes:
         nodes.start("recorder", params_file=files, out=str(Path(out).absolute()),

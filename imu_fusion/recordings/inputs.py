@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from imu_fusion.recordings.bag_reader import Reader
+from imu_fusion.sources.source import ARRAY_TOPIC
 
 
 def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[str, str]
@@ -15,26 +16,33 @@ def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[s
 
     Returns:
         dict of our topic to its name in the recording, and words for required ones that it
-        lacks, '' if none.
-
-    Raises:
-        TopicError: a topic has another type.
+        lacks, '' if none. An optional one of another type is lacking, too, and ``reader.warnings``
+        says so.
     """
-    names = {}
+    names, missing = {}, []
     for topic, msgtype in {**required, **optional}.items():
         name = reader.find(topic)
-        if name is not None and reader.topics[name].count:
-            names[topic] = reader.require(name, msgtype).name
-    missing = {topic: msgtype for topic, msgtype in required.items() if topic not in names}
-    return names, "; ".join(_explain_missing(reader, *item) for item in missing.items())
+        if name is None or not reader.topics[name].count:
+            why = f"no messages on '{topic}' ({msgtype})"
+        elif reader.topics[name].msgtype != msgtype:
+            why = f"topic '{name}' is {reader.topics[name].msgtype}, expected {msgtype}"
+            if topic in optional:
+                reader.mention(f"{why}; it is left out")
+        else:
+            names[topic] = name
+            continue
+        if topic in required:
+            missing.append(f"{why}; {_instead(reader, topic, msgtype)}")
+    return names, "; ".join(missing)
 
 
-def _explain_missing(reader, topic, msgtype):
-    """Words for a topic that a recording lacks, with the ones in it that would fit."""
-    text = f"no messages on '{topic}' ({msgtype}); "
-    fitting = [t.name for t in reader.topics.values() if t.msgtype == msgtype and t.count]
+def _instead(reader: Reader, topic: str, msgtype: str) -> str:
+    """Words for the topics of a recording that would fit. One accelerometer of an array does not,
+    though its messages have the type of an Imu's."""
+    fitting = [t.name for t in reader.topics.values() if t.msgtype == msgtype and t.count
+               and not t.name.lstrip("/").startswith(ARRAY_TOPIC)]
     if fitting:
-        return (f"{text}of that type it has {', '.join(fitting)}: add "
+        return (f"of that type it has {', '.join(fitting)}: add "
                 f"--remap {topic}:={fitting[0]}")
     others = ", ".join(f"{t.name} ({t.msgtype})" for t in reader.topics.values())
-    return f"{text}it has {others or 'no topics'}"
+    return f"it has {others or 'no topics'}"

@@ -33,7 +33,8 @@ def read_source(path: Path, source: Source) -> list[Block]:
         ImuFusionError: names the file, and the line or part that is wrong.
     """
     try:
-        blocks = [block for part, data in parts(path) for block in source.feed(data, part)]
+        blocks = [block for part, data in parts(path, lose=lambda text: source.lost.update([text]))
+                  for block in source.feed(data, part)]
         return [in_range(block, source) for block in blocks + source.finish()]
     except ImuFusionError:
         raise
@@ -74,8 +75,9 @@ class SourceStorage(Storage):
         for remark in source.remarks:
             mention(remark)
         if not found:
-            raise BagError("; ".join([f"{path}: {known.about if known else 'a table'}, without any "
-                                      "samples", *source.remarks]))
+            raise BagError("; ".join([
+                f"{path}: {known.about if known else 'a table'}, without any samples",
+                *(f"{count} {what}" for what, count in source.lost.items()), *source.remarks]))
         self._logs = {topic: _sorted(logs) for topic, logs in found.items()}
         for topic, log in self._logs.items():
             self.topics[topic] = StoredTopic(topic, msgtype_of(log), len(log), [qos_profile()])

@@ -10,8 +10,8 @@ it tell a clock that was set from a stamp that is wild.
   same true time has two stamps then, and none of them says how much time has passed: a new
   *epoch* begins, and estimators start anew with it.
 - Set *ahead*: a gap, over which estimators predict; beyond ``OTHER_CLOCK`` a new epoch, too. One
-  sample ahead, and the others behind it again: its stamp is wild. Were it believed, all those up to
-  it would be refused.
+  sample or two ahead, and the others behind them again: their stamps are wild. Were they believed,
+  all those up to them would be refused.
 
 All of this follows from the sequence of the samples of a topic alone, not from when they come.
 """
@@ -29,14 +29,14 @@ JUMP = 1_000_000_000
 """Nanoseconds. Transport delays reorder samples by less, sensors pause for less."""
 
 AHEAD = 50_000_000
-"""Nanoseconds. What is ahead by more waits for the sample after it."""
+"""Nanoseconds. What is ahead by more waits for the samples after it."""
 
 OTHER_CLOCK = 7 * 86400 * 1_000_000_000
 """Nanoseconds. No recording pauses for so long; a computer that boots without a clock jumps by
 more."""
 
 _SLOW = 5          # usual intervals: what is ahead by no more is no jump, of slow sensors
-_AGREEING = 3      # samples in a row that make a clock that was set back
+_AGREEING = 3      # samples in a row that make a clock that was set
 _HOLE = 1.5        # usual intervals: a longer one has lost a sample
 _UNPROVEN = 3600 * 1_000_000_000    # a pause before the very last sample may be as long
 _PARTS = 64        # after how many parts the latest samples are put together
@@ -167,8 +167,7 @@ class Guard:
             side = self._side(stamp, follows, limit)
             if side > 0:
                 self._held.append((stamp, row))
-                ahead = self.last is not None and self._held[0][0] > self.last
-                if ahead or side > 1 or len(self._held) >= _AGREEING:
+                if side > 1 or len(self._held) >= _AGREEING:
                     self._believe(found)
                 return
             self._drop(found)

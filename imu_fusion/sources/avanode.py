@@ -24,13 +24,12 @@ from imu_fusion.sources.source import (
     STANDARD_GRAVITY,
     VELOCITY_TOPIC,
     Block,
-    Lines,
     Source,
     named,
     number,
     numbers,
 )
-from imu_fusion.sources.table import TableReader
+from imu_fusion.sources.table import Rows, TableReader
 
 _WRAP = 2 ** 32    # of the clock of microseconds
 _FIX_3D = (3, 4)   # UBX fixType: 3-D, 3-D with dead reckoning
@@ -48,7 +47,7 @@ class AvanodeImu(Source):
 
     def __init__(self, strict: bool = True) -> None:
         super().__init__(strict)
-        self._lines = Lines()
+        self._reader: TableReader | None = None
         self._factors: list[float] | None = None
         self._last: int | None = None
         self._turns = 0
@@ -57,11 +56,16 @@ class AvanodeImu(Source):
         self._part = ""
 
     def feed(self, data: bytes, part: str = "") -> list[Block]:
-        self._part = part
-        return self._read(self._lines.feed(data))
+        if self._reader is None:
+            self._part = part
+            self._reader = TableReader(TableParams(header=False), part)
+        return self._read(self._reader.feed(data))
 
     def finish(self) -> list[Block]:
-        blocks = self._read(self._lines.finish())
+        blocks = []
+        if self._reader is not None:
+            blocks = self._read(self._reader.finish())
+            self._reader.account(self.lost)
         if self._factors is None:
             raise SampleError(f"{self._part}: no line '#date,factor acc,factor gyro,factor mag,"
                               "sync,id#'")
@@ -69,24 +73,28 @@ class AvanodeImu(Source):
             raise SampleError(f"{self._part}: no samples")
         return blocks
 
-    def _read(self, lines: list[tuple[int, str]]) -> list[Block]:
-        rows: list[tuple[int, list[str]]] = []
-        for line, text in lines:
-            if text.startswith("#"):
-                self._header(line, text)
-            elif text.strip():
-                rows.append((line, text.split(",")))
-        if not rows:
-            return []
-        if self._factors is None:
-            raise SampleError(f"{self._part}, line {rows[0][0]}: no line '#date,factor acc,factor "
-                              "gyro,factor mag,sync,id#' before it")
+    def _read(self, rows: Rows) -> list[Block]:
+        assert self._reader is not None
+        samples = Rows([], [])
+        for line, cells in zip(*rows):
+            if cells and cells[0].startswith("#"):
+                self._header(line, cells)
+            elif self._factors is None:
+                raise SampleError(f"{self._part}, line {line}: no line '#date,factor acc,factor "
+                                  "gyro,factor mag,sync,id#' before it")
+            else:
+                samples.lines.append(line)
+                samples.cells.append(cells)
+        return [block for part in self._reader.sound(samples, self._samples) for block in part]
+
+    def _samples(self, rows: Rows) -> list[Block]:
+        assert self._factors is not None
         values = np.column_stack([self._column(rows, k) for k in range(len(_COLUMNS))])
-        bad = ~np.isfinite(values[:, 0])
+        bad = ~((values[:, 0] >= 0) & (values[:, 0] < _WRAP))
         if bad.any():
-            raise SampleError(f"{self._part}, line {rows[int(np.argmax(bad))][0]}, column 'time': "
-                              "not a number")
-        self._count += len(rows)
+            raise SampleError(f"{self._part}, line {rows.lines[int(np.argmax(bad))]}, column "
+                              "'time': not a number of its clock")
+        self._count += len(values)
         stamp = self._stamps(values[:, 0].astype(np.int64))
         acc_factor, gyr_factor, mag_factor = self._factors
         imu = ImuLog(stamp, np.radians(values[:, 4:7] / gyr_factor),
@@ -96,14 +104,13 @@ class AvanodeImu(Source):
         self._mag = mag[-1]
         return named({IMU_TOPIC: imu, MAG_TOPIC: MagLog(stamp, mag)[(mag != before).any(axis=1)]})
 
-    def _column(self, rows: list[tuple[int, list[str]]], place: int) -> np.ndarray:
+    def _column(self, rows: Rows, place: int) -> np.ndarray:
         name = _COLUMNS[place]
-        for line, cells in rows:
+        for line, cells in zip(*rows):
             if len(cells) <= place:
                 raise SampleError(f"{self._part}, line {line}: {len(cells)} cells, column '{name}' "
                                   "is missing")
-        return numbers(self._part, name, [line for line, _ in rows],
-                       [cells[place].strip() for _, cells in rows])
+        return numbers(self._part, name, rows.lines, [cells[place] for cells in rows.cells])
 
     def _stamps(self, time: np.ndarray) -> np.ndarray:
         before = np.r_[time[0] if self._last is None else self._last, time[:-1]]
@@ -111,9 +118,8 @@ class AvanodeImu(Source):
         self._turns, self._last = int(turns[-1]), int(time[-1])
         return EPOCH + 1000 * (time + _WRAP * turns)
 
-    def _header(self, line: int, text: str) -> None:
+    def _header(self, line: int, cells: list[str]) -> None:
         """Counts per g, deg/s and uT: '#date,acc,gyro,mag,sync,id#'."""
-        cells = text.strip().strip("#").split(",")
         if self._factors is not None or len(cells) != 6 or re.search("[a-z]", cells[1]):
             return
         factors = [number(self._part, f"factor {name}", line, cells[k])
@@ -146,11 +152,17 @@ class AvanodeGnss(Source):
         return self._read(self._reader.feed(data))
 
     def finish(self) -> list[Block]:
-        return [] if self._reader is None else self._read(self._reader.finish())
-
-    def _read(self, rows) -> list[Block]:
-        if not rows.lines:
+        if self._reader is None:
             return []
+        blocks = self._read(self._reader.finish())
+        self._reader.account(self.lost)
+        return blocks
+
+    def _read(self, rows: Rows) -> list[Block]:
+        assert self._reader is not None
+        return [block for part in self._reader.sound(rows, self._solutions) for block in part]
+
+    def _solutions(self, rows: Rows) -> list[Block]:
         assert self._reader is not None
         tow, fix_type, lon, lat, height, north, east, down = (
             factor * self._reader.numbers(rows, name, self._reader.texts(

@@ -5,6 +5,7 @@ Elevations are above sea level, as GPX has them; accuracies are not told.
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
@@ -22,37 +23,56 @@ class Gpx(Source):
         super().__init__(strict)
         self._parser: Any = ElementTree.XMLPullParser(["end"])
         self._part, self._seen = "", 0
+        self._broken = ""    # why the rest of the file cannot be read
+        self._bad = ""       # why the first of the points that cannot be read cannot
 
     def feed(self, data: bytes, part: str = "") -> list[Block]:
         self._part = part
+        if self._broken:
+            return []
         if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
             raise SampleError(f"{part}: declares entities, which no track needs")
-        try:
-            self._parser.feed(data)
-            return self._points()
-        except ElementTree.ParseError as error:
-            raise SampleError(f"{part}: no GPX ({error})") from None
+        self._parser.feed(data)
+        return self._points()
 
     def finish(self) -> list[Block]:
-        try:
-            self._parser.close()
-        except ElementTree.ParseError as error:
-            raise SampleError(f"{self._part}: ends in the middle ({error})") from None
+        if not self._broken:
+            try:
+                self._parser.close()
+            except ElementTree.ParseError as error:
+                self._broken = f"ends in the middle ({error})"
         blocks = self._points()
         if not self._seen:
-            raise SampleError(f"{self._part}: no track points with time and elevation")
+            why = self._broken or "no track points with time and elevation"
+            raise SampleError(self._bad or f"{self._part}: {why}")
+        if self._bad:
+            self.remark(f"the first that cannot be read: {self._bad}")
+        if self._broken:
+            self.lost[f"part of the track, as {self._part} {self._broken}"] += 1
         return blocks
+
+    def _elements(self) -> Iterator[ElementTree.Element]:
+        """Those that are complete, up to where the file is none any more."""
+        try:
+            for _, element in self._parser.read_events():
+                yield element
+        except ElementTree.ParseError as error:
+            self._broken = self._broken or f"is no GPX from some place on ({error})"
 
     def _points(self) -> list[Block]:
         rows = []
-        for _, element in self._parser.read_events():
+        for element in self._elements():
             tag = element.tag.rpartition("}")[2]
             if tag == "trkpt":
                 texts = {child.tag.rpartition("}")[2]: child.text for child in element}
-                if texts.get("time") and texts.get("ele"):
-                    rows.append(self._row(element, texts))
-                else:
-                    self.lost["track points without time or elevation"] += 1
+                try:
+                    if texts.get("time") and texts.get("ele"):
+                        rows.append(self._row(element, texts))
+                    else:
+                        self.lost["track points without time or elevation"] += 1
+                except SampleError as error:
+                    self.lost["track points that cannot be read"] += 1
+                    self._bad = self._bad or str(error)
             if tag in ("trkpt", "trkseg"):
                 element.clear()
         if not rows:

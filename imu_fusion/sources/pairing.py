@@ -42,6 +42,12 @@ class Pairing:
         """No force follows: what waits for one is left out."""
         return self._pair(ends=True)
 
+    def remarks(self) -> list[str]:
+        """What to say at the end."""
+        return [f"{count} {what} are left out" for count, what in (
+            (self.left_out, "rates without a force beside them"),
+            (self.repeated, "readings whose time does not rise")) if count]
+
     def _pair(self, ends: bool) -> ImuLog:
         if not self._rates.parts or not (self._forces.parts or ends):
             return ImuLog(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))

@@ -15,6 +15,8 @@ import io
 import json
 import re
 import zipfile
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import PurePosixPath
 from urllib.parse import quote
 
@@ -25,6 +27,7 @@ from imu_fusion.samples.logs import FixLog, MagLog, VelocityLog
 from imu_fusion.sources.description import TableParams
 from imu_fusion.sources.pairing import Pairing
 from imu_fusion.sources.source import (
+    BROKEN,
     EPOCH,
     FIX_TOPIC,
     FIXED,
@@ -73,11 +76,12 @@ class Phone:
         return named({IMU_TOPIC: self.pairing.add(**{
             "forces" if kind == "accelerometer" else "rates": (stamp, values)})})
 
-    def alone(self) -> str:
-        """What to say where the accelerometer or the gyroscope has no other one beside it."""
+    def remarks(self) -> list[str]:
+        """What to say of the readings at the end."""
         there = [kind for kind in ("accelerometer", "gyroscope") if kind in self._seen]
-        return f"{IMU_TOPIC} needs accelerometer and gyroscope; there is the {there[0]} alone" if (
-            len(there) == 1) else ""
+        alone = [f"{IMU_TOPIC} needs accelerometer and gyroscope; there is the {there[0]} alone"
+                 ] if len(there) == 1 else []
+        return alone + self.pairing.remarks()
 
     def finish(self) -> list[Block]:
         """What waited for more."""
@@ -107,6 +111,11 @@ class PhyphoxExport(WholeSource):
 
     def finish(self) -> list[Block]:
         sheets = dict(_sheets(self.parts))
+        for name in [name for name, sheet in sheets.items() if not sheet.rows.lines]:
+            sheet = sheets.pop(name)
+            if _kind(name, sheet) in ("accelerometer", "gyroscope"):
+                raise SampleError(f"{sheet.where}: no rows of numbers")
+            self.remark(f"{sheet.where}: no rows of numbers")    # of a sensor that gave none
         clock = _clock(sheets.pop("time", None))
         if clock is None:
             self.remark("the export has no meta/time.csv: stamps begin at an arbitrary instant")
@@ -115,24 +124,20 @@ class PhyphoxExport(WholeSource):
         for name, sheet in sheets.items():
             kind = _kind(name, sheet)
             if kind == "location":
-                time, values = sheet.read(_LOCATION)
-                sheet.check_degrees(values)
-                blocks += locations(_stamps(sheet, time, clock), values)
+                time, values = sheet.read(_LOCATION, self.lost)
+                blocks += locations(_stamps(time, clock), values)
             elif kind:
-                time, values = sheet.read({axis: _SENSORS[kind] for axis in "xyz"})
-                if kind == "accelerometer":
-                    sheet.check_rising(time)
+                time, values = sheet.read({axis: _SENSORS[kind] for axis in "xyz"}, self.lost,
+                                          rising=kind == "accelerometer")
                 values = values * (1e-6 if kind == "magnetometer" else 1.0)
-                blocks += phone.vectors(kind, _stamps(sheet, time, clock), values)
+                blocks += phone.vectors(kind, _stamps(time, clock), values)
         blocks += phone.finish()
-        if phone.alone():
-            self.remark(phone.alone())
         if phone.pairing.left_out and not any(block.topic == IMU_TOPIC for block in blocks):
             names = " and ".join(n for n in sheets if _kind(n, sheets[n]) in (
                 "accelerometer", "gyroscope"))
             raise SampleError(f"{names} have no time in common")
-        if phone.pairing.left_out:
-            self.remark(f"{phone.pairing.left_out} rates without a force beside them are left out")
+        for text in phone.remarks():
+            self.remark(text)
         return blocks
 
 
@@ -142,35 +147,59 @@ class _Sheet:
     def __init__(self, where: str, reader: TableReader, rows: Rows) -> None:
         self.where, self.rows, self._reader = where, rows, reader
         self.names = reader.names or []
-        if len(rows.lines) < 1:
-            raise SampleError(f"{where}: no rows of numbers")
 
-    def read(self, wanted: dict[str, tuple[str, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        """(times (n,) in s, values (n, k)) of the columns 'name (unit)'."""
+    def read(self, wanted: Mapping[str, tuple[str, ...]], lost: Counter[str],
+             rising: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """(times (n,) in s, values (n, k)) of the columns 'name (unit)'; rows that cannot be read
+        are counted in ``lost``, and so are those that no later one follows, if times are to be
+        ``rising``."""
         names = [self._name("time|zeit|temps", ("s",)) if "time" in self.names[0].lower()
                  else self.names[0], *(self._name(*item) for item in wanted.items())]
-        time, *values = (self.column(name) for name in names)
-        return time, np.column_stack(values)
+        found = self._sound(names, "latitude" in wanted)
+        self._reader.account(lost)
+        line, time, values = found[:, 0], found[:, 1], found[:, 2:]
+        if not rising:
+            return time, values
+        followed = np.r_[np.diff(time) > 0, np.full(min(len(time), 1), len(time) > 1)]
+        alone = np.flatnonzero(~followed)
+        if len(alone) > BROKEN * len(time):
+            raise SampleError(f"{self.where}, line {line[alone[0]]:.0f}: no later time follows")
+        if len(alone):
+            lost[f"readings of {self.where} that no later time follows"] += len(alone)
+        return time[followed], values[followed]
 
-    def column(self, name: str) -> np.ndarray:
-        """(n,) numbers of a column, which errors call by its name without the unit."""
-        texts = self._reader.pointed(self._reader.texts(self.rows, name, _bare(name)))
-        return self._reader.numbers(self.rows, _bare(name), texts)
+    def events(self, names: list[str]) -> list[tuple[str, float, float]]:
+        """(event, two numbers) of each row of the times of measuring that can be read."""
+        return [row for part in self._reader.sound(self.rows, lambda rows: list(zip(
+            self._reader.texts(rows, names[0]), *(self._column(rows, n) for n in names[1:]))))
+            for row in part]
 
-    def check_rising(self, time: np.ndarray) -> None:
-        """The times of the forces must rise."""
-        step = np.diff(time)
-        if len(step) == 0 or (step <= 0).any():
-            line = self.rows.lines[int(np.argmax(np.r_[step <= 0, True]))]
-            raise SampleError(f"{self.where}, line {line}: no later time follows")
+    def _sound(self, names: list[str], degrees: bool) -> np.ndarray:
+        """(m, 1 + k) of rows that can be read: line, and numbers of columns of which the first is
+        the time."""
+        def read(rows):
+            found = np.column_stack([rows.lines, *(self._column(rows, name) for name in names)])
+            self._check(rows, found, ~(np.abs(found[:, 1]) < _LONGEST), lambda row: (
+                f", column 'Time': {row[1]:g} s is not a time since the start of the experiment"))
+            if degrees:
+                self._check(rows, found, (np.abs(found[:, 2]) > 90) | (np.abs(found[:, 3]) > 360),
+                            lambda row: f": latitude {row[2]:g}, longitude {row[3]:g} are not "
+                                        "degrees")
+            return found
 
-    def check_degrees(self, values: np.ndarray) -> None:
-        """Latitude and longitude."""
-        bad = (np.abs(values[:, 0]) > 90) | (np.abs(values[:, 1]) > 360)
+        return np.concatenate([np.empty((0, 1 + len(names))),
+                               *self._reader.sound(self.rows, read)])
+
+    def _check(self, rows: Rows, found: np.ndarray, bad: np.ndarray,
+               words: Callable[[np.ndarray], str]) -> None:
         if bad.any():
             k = int(np.argmax(bad))
-            raise SampleError(f"{self.where}, line {self.rows.lines[k]}: latitude "
-                              f"{values[k, 0]:g}, longitude {values[k, 1]:g} are not degrees")
+            raise SampleError(f"{self.where}, line {rows.lines[k]}{words(found[k])}")
+
+    def _column(self, rows: Rows, name: str) -> np.ndarray:
+        """(n,) numbers of a column, which errors call by its name without the unit."""
+        texts = self._reader.pointed(self._reader.texts(rows, name, _bare(name)))
+        return self._reader.numbers(rows, _bare(name), texts)
 
     def _name(self, wanted: str, permitted: tuple[str, ...]) -> str:
         found = None
@@ -201,7 +230,7 @@ def _sheets(parts):
             yield from _excel(part, data)
         elif path.suffix.lower() == ".csv":
             reader = TableReader(_dialect(data), part)
-            rows = reader.feed(data + b"\n")
+            rows = reader.whole(data)
             yield path.stem if path.parent.name == "meta" else str(path), _Sheet(part, reader, rows)
 
 
@@ -230,8 +259,8 @@ def _excel(part: str, data: bytes):
         text = "\n".join("\t".join(str(cell).replace("\t", " ").replace("\n", " ") for cell in row)
                          for row in rows)
         reader = TableReader(TableParams(delimiter="tab"), f"{part}, sheet {name}")
-        found = reader.feed(text.encode() + b"\n")
-        if found.lines:
+        found = reader.whole(text.encode())
+        if reader.names:
             meta = {"Metadata Time": "time", "Metadata Device": "device"}.get(name, name)
             yield meta, _Sheet(f"{part}, sheet {name} (Excel files of phyphox are known, others "
                                "have to be saved as CSV)", reader, found)
@@ -274,20 +303,13 @@ def _clock(sheet: _Sheet | None) -> list[tuple[float, int]] | None:
              for wanted in ("event", "experiment time", "system time")]
     if not all(names):
         return None
-    events = [row[sheet.names.index("event")] for row in sheet.rows.cells]
-    since, unix = sheet.column(names[1]), sheet.column(names[2])
     starts = [(float(t), round(u * 1000) * 1_000_000 - round(t * NANOSECONDS))
-              for event, t, u in zip(events, since, unix)
+              for event, t, u in sheet.events(names)
               if event == "START" and abs(t) < _LONGEST and _UNIX[0] < u < _UNIX[1]]
     return starts or None
 
 
-def _stamps(sheet: _Sheet, time: np.ndarray, clock: list[tuple[float, int]] | None) -> np.ndarray:
-    bad = ~((time >= 0) & (time < _LONGEST))
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise SampleError(f"{sheet.where}, line {sheet.rows.lines[k]}, column 'Time': {time[k]:g} "
-                          "s is not a time since the start of the experiment")
+def _stamps(time: np.ndarray, clock: list[tuple[float, int]] | None) -> np.ndarray:
     zeros = clock or [(0.0, EPOCH)]
     stretch = np.clip(np.searchsorted([t for t, _ in zeros], time, "right") - 1, 0, None)
     return np.array([zero for _, zero in zeros])[stretch] + np.round(

@@ -21,6 +21,7 @@ from imu_fusion.sources.tables import Tables
 from imu_fusion.sources.ulog import MAGIC, Ulog
 from imu_fusion.sources.ximu3 import Ximu3, Ximu3Csv, is_csv
 
+_SENTENCE = re.compile(rb"^\$G[A-Z]{4},", re.MULTILINE)
 HEAD = 1 << 16    # bytes of each part by which a format is recognised
 Heads = Mapping[str, bytes]
 """The first bytes of each part: of one file under its name, or of those of a folder or archive."""
@@ -74,7 +75,8 @@ def _is_receiver(heads: Heads) -> bool:
     if len(heads) != 1:
         return False
     head, = heads.values()
-    return len(Frames(Counter()).feed(head)) >= 2
+    # Sentences whose checksums are wrong, or missing, are to be told of as such.
+    return len(Frames(Counter()).feed(head)) >= 2 or len(_SENTENCE.findall(head)) >= 2
 
 
 def _is_ximu3(heads: Heads) -> bool:

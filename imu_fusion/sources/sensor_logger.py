@@ -61,7 +61,8 @@ class SensorLoggerExport(WholeSource):
                   if PurePosixPath(part).suffix.lower() == ".csv"}
         meta = _metadata(*tables.get("metadata", ("", b"")))
         self.device = meta.get("device name", "")[:80]
-        vectors = {name: _vectors(*tables[name]) for name in _VECTORS if name in tables}
+        vectors = {name: self._read(*tables[name], ("x", "y", "z")) for name in _VECTORS
+                   if name in tables}
         sign, unit = self._convention(meta, vectors)
         phone, blocks = Phone(), []
         forces, rates = _forces(vectors, sign, unit), vectors.get("gyroscope") or vectors.get(
@@ -75,12 +76,10 @@ class SensorLoggerExport(WholeSource):
             blocks += phone.vectors("magnetometer", mag[0], mag[1] * 1e-6)
         if "location" in tables:
             start = min((v[0][0] for v in vectors.values() if len(v[0])), default=0)
-            blocks += self._locations(*_location(*tables["location"]), start)
+            blocks += self._locations(*self._read(*tables["location"], _LOCATION), start)
         blocks += phone.finish()
-        if phone.pairing.left_out:
-            self.remark(f"{phone.pairing.left_out} rates without a force beside them are left out")
-        if phone.alone():
-            self.remark(phone.alone())
+        for text in phone.remarks():
+            self.remark(text)
         if rates is not None and forces is None:
             self.remark("no acceleration with gravity: neither TotalAcceleration nor "
                         "Accelerometer and Gravity were logged")
@@ -100,6 +99,28 @@ class SensorLoggerExport(WholeSource):
         raise SampleError(f"{folder}: Metadata.csv does not tell the platform, and with it the "
                           "sign of accelerations: put the file of the export back, or give a "
                           "description with 'platform: android' or 'platform: ios'")
+
+    def _read(self, part: str, data: bytes, names: tuple[str, ...]
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """(stamps (n,), values (n, k)) of a table, in order; NaN for columns that it lacks."""
+        reader = TableReader(TableParams(), part)
+        rows = reader.whole(data)
+        known = {name.lower(): name for name in reader.names or ()}
+
+        def read(rows):
+            stamps = reader.stamps(rows, _TIME)
+            if min(stamps) < 0 or max(stamps) >= 2**63:
+                raise SampleError(f"{part}: column 'time' goes from {min(stamps):.4g} to "
+                                  f"{max(stamps):.4g}, which are no nanoseconds since 1970")
+            none = np.full(len(stamps), np.nan)
+            return np.array(stamps, dtype=np.int64), np.column_stack(
+                [reader.column(rows, known[name]) if name in known else none for name in names])
+
+        found = [(np.empty(0, np.int64), np.empty((0, len(names)))), *reader.sound(rows, read)]
+        reader.account(self.lost)
+        stamp, values = (np.concatenate(parts) for parts in zip(*found))
+        order = np.argsort(stamp, kind="stable")
+        return stamp[order], values[order]
 
     def _locations(self, stamp: np.ndarray, values: np.ndarray, start: int) -> list[Block]:
         late = stamp >= start
@@ -132,31 +153,6 @@ def _metadata(part: str, data: bytes) -> dict[str, str]:
     lines = data.decode("utf-8-sig", "replace").splitlines()[:2]
     rows = list(csv.reader(lines))
     return {k.strip(): v for k, v in zip(*rows)} if len(rows) == 2 else {}
-
-
-def _read(part: str, data: bytes, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    reader = TableReader(TableParams(), part)
-    rows = reader.feed(data + b"\n")
-    if not rows.lines:
-        return np.empty(0, np.int64), np.empty((0, len(names)))
-    known = {name.lower(): name for name in reader.names or ()}
-    stamps = reader.stamps(rows, _TIME)
-    if min(stamps) < 0 or max(stamps) >= 2**63:
-        raise SampleError(f"{part}: column 'time' goes from {min(stamps):.4g} to "
-                          f"{max(stamps):.4g}, which are no nanoseconds since 1970")
-    stamp = np.array(stamps, dtype=np.int64)
-    none = np.full(len(stamp), np.nan)
-    columns = [reader.column(rows, known[name]) if name in known else none for name in names]
-    order = np.argsort(stamp, kind="stable")
-    return stamp[order], np.column_stack(columns)[order]
-
-
-def _vectors(part: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    return _read(part, data, ("x", "y", "z"))
-
-
-def _location(part: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    return _read(part, data, _LOCATION)
 
 
 def _forces(vectors, sign, unit):

@@ -88,7 +88,8 @@ def sketch(data: bytes, where: str) -> Sketch:
     result = Sketch()
     delimiter = {"\t": "tab"}.get(layout.delimiter, layout.delimiter)
     for key, value, usual in (("delimiter", delimiter, ","), ("decimal", layout.decimal, "."),
-                              ("skip_lines", layout.skip, 0), ("header", layout.header, True)):
+                              ("comment", layout.comment, None), ("skip_lines", layout.skip, 0),
+                              ("header", layout.header, True)):
         if value != usual:
             result.content[key] = value
     values, columns = layout.values(), layout.columns()

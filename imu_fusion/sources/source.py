@@ -22,6 +22,8 @@ STANDARD_GRAVITY = 9.80665
 NO_FIX, FIXED = -1, 0    # sensor_msgs/NavSatStatus
 #: Stamps of devices that count from when they were switched on begin here.
 EPOCH = 1_600_000_000_000_000_000
+#: Share of the rows of a table; where more are broken it is not the rows that are wrong.
+BROKEN = 0.15
 LONGEST_LINE = 1 << 16   # bytes
 LARGEST_WHOLE = 1 << 30  # bytes of a format that can only be read as a whole
 # Python's own numbers would also be 1_0 and digits of other scripts.

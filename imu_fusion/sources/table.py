@@ -2,10 +2,11 @@
 :class:`~imu_fusion.sources.description.Description` says."""
 
 import csv
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from decimal import Decimal
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from imu_fusion.sources.description import (
 )
 from imu_fusion.sources.source import (
     ARRAY_TOPIC,
+    BROKEN,
     FIX_TOPIC,
     FIXED,
     IMU_TOPIC,
@@ -49,8 +51,13 @@ from imu_fusion.sources.times import NANOSECONDS, calendar
 GPS_EPOCH = 315_964_800    # 1980-01-06 in Unix time
 _WEEK = 7 * 86400
 _DIGITS = 22           # of nanoseconds, with room
+_MANY = 1000           # broken rows, after which the share is looked at before the end
 # m/s, where a speed and a course say nothing of the vertical.
 UNKNOWN_CLIMB_SD = 100.0
+
+
+_NO_TEXT = "not a table of text: zeros, or carriage returns that end no line, are in it"
+Result = TypeVar("Result")
 
 
 class Rows(NamedTuple):
@@ -58,6 +65,10 @@ class Rows(NamedTuple):
 
     lines: list[int]
     cells: list[list[str]]
+
+    def part(self, first: int, end: int) -> "Rows":
+        """Some of them."""
+        return Rows(self.lines[first:end], self.cells[first:end])
 
 
 class TableReader:
@@ -67,14 +78,20 @@ class TableReader:
         table: how it is written.
         where: what is named in errors.
         wanted: columns that tell the header of a stream that may begin in the middle; lines before
-            it, and what is no text, are ``skipped``.
+            it are ``skipped``.
 
-    ``names`` are those of the columns once the header has come.
+    ``names`` are those of the columns once the header has come, ``broken`` counts rows that cannot
+    be read.
     """
 
     def __init__(self, table: TableParams, where: str, wanted: Collection[str] = ()) -> None:
         self.names: list[str] | None = None
         self.skipped = 0
+        self.broken = 0                     # rows that cannot be read
+        self._count = 0                     # rows
+        self._width = 0                     # most cells that a row may have
+        self._why = ""                      # the first one cannot be read
+        self._last_broken, self._cut = 0, -1    # lines: the latest of them, and one without an end
         self._wanted = set(wanted)
         self._table, self._where = table, where
         self._lines = Lines()
@@ -86,7 +103,62 @@ class TableReader:
 
     def finish(self) -> Rows:
         """The last row, if no line end followed."""
-        return self._rows(self._lines.finish())
+        lines = self._lines.finish()
+        self._cut = lines[-1][0] if lines else -1
+        return self._rows(lines)
+
+    def whole(self, data: bytes) -> Rows:
+        """All rows of a table that is at hand as a whole."""
+        rows, last = self.feed(data), self.finish()
+        return Rows(rows.lines + last.lines, rows.cells + last.cells)
+
+    def sound(self, rows: Rows, read: Callable[[Rows], Result]) -> list[Result]:
+        """What ``read`` makes of rows, in parts around those of which it raises a SampleError:
+        they are broken, and :meth:`account` tells of them.
+
+        Raises:
+            SampleError: so many are that something else is wrong.
+        """
+        if not rows.lines:
+            return []
+        try:
+            self._check_widths(rows)
+            return [read(rows)]
+        except SampleError as error:
+            if len(rows.lines) == 1:
+                self._break(rows.lines[0], str(error) if rows.cells[0] else _NO_TEXT)
+                return []
+        half = len(rows.lines) // 2
+        return [*self.sound(rows.part(0, half), read),
+                *self.sound(rows.part(half, len(rows.lines)), read)]
+
+    def account(self, lost: Counter[str], strict: bool = True) -> None:
+        """Count the broken rows under words.
+
+        Raises:
+            SampleError: ``strict``, and so many are broken that something else is wrong: the first
+                reason. A last line without an end was cut off, and tells nothing of the others.
+        """
+        if strict and self.broken - (self._cut == self._last_broken) > BROKEN * self._count:
+            raise SampleError(self._why)
+        if self.broken:
+            lost[f"lines that cannot be read, the first: {self._why}"] = self.broken
+
+    def _check_widths(self, rows: Rows) -> None:
+        """Refuse a row that is wider than the names and the first one: two that ran together."""
+        self._width = self._width or max(len(self.names or ()), len(rows.cells[0]))
+        if max(map(len, rows.cells)) > self._width:
+            line, cells = next((line, cells) for line, cells in zip(*rows)
+                               if len(cells) > self._width)
+            raise SampleError(f"{self._where}, line {line}: {len(cells)} cells, more than the "
+                              f"{self._width} of the others")
+
+    def _break(self, line: int, why: str) -> None:
+        self._why = self._why or (f"{self._where}, line {line}: {why}" if why is _NO_TEXT else why)
+        self.broken += 1
+        self._last_broken = line
+        if self.broken > max(_MANY, BROKEN * self._count) and not self._wanted:
+            raise SampleError(self._why)
 
     def place(self, name: str) -> int:
         """The index of a column, or a ParameterError."""
@@ -138,13 +210,13 @@ class TableReader:
         for line, text in lines:
             if line <= table.skip_lines or (table.comment and text.startswith(table.comment)):
                 continue
-            if "\0" in text or "\r" in text:
-                if not self._wanted:
-                    raise SampleError(f"{self._where}, line {line}: not a table of text")
-                self.skipped += 1
+            no_text = "\0" in text or "\r" in text
+            cells = [] if no_text else self._cells(text)
+            if not any(cells) and not no_text:
                 continue
-            cells = self._cells(text)
-            if not any(cells):
+            if no_text and self.names is None:
+                self._count += 1
+                self._break(line, _NO_TEXT)
                 continue
             if self.names is None and not table.header:
                 self.names = [str(i + 1) for i in range(len(cells))]
@@ -156,6 +228,7 @@ class TableReader:
                 continue
             rows.lines.append(line)
             rows.cells.append(cells)
+        self._count += len(rows.lines)
         return rows
 
     def _cells(self, text: str) -> list[str]:
@@ -187,6 +260,19 @@ def _stamp(where: str, line: int, text: str, week: float, time: TimeParams) -> i
                           "time") from None
 
 
+class _Clock(NamedTuple):
+    """How the times of a table stand: number of rows read, how often the counter of the times began
+    anew and its last value, ns of the last row, how many times fell back, and line and ns of the
+    first one that did."""
+
+    rows: int = 0
+    turns: int = 0
+    last: int | None = None
+    latest: int = 0
+    falls: int = 0
+    fall: tuple[int, int] = (0, 0)
+
+
 class TableSource(Source):
     """A table, or lines of one, as a :class:`Description` says."""
 
@@ -194,12 +280,7 @@ class TableSource(Source):
         super().__init__(strict)
         self._description = description
         self.topics = description.topics()
-        self._count = 0       # rows, for those without times
-        self._turns = 0       # how often the counter of the times began anew
-        self._last: int | None = None
-        self._latest = 0      # ns, of the last row
-        self._falls = 0       # times that fell back
-        self._fall = 0, 0     # line and ns of the first one
+        self._clock = _Clock()
         self._reader: TableReader | None = None
         self._where = where
 
@@ -213,13 +294,17 @@ class TableSource(Source):
         return self._blocks(self._reader.feed(data))
 
     def finish(self) -> list[Block]:
-        blocks = [] if self._reader is None else self._blocks(self._reader.finish())
-        if self.strict and self._count < 2:
-            raise SampleError(f"{self._where}: {self._count} rows of numbers; is skip_lines or "
-                              "header right?")
-        if self._falls:
-            line, back = self._fall
-            self.remark(f"{self._falls} times fall back, the first in line {line} by "
+        blocks = []
+        if self._reader is not None:
+            blocks = self._blocks(self._reader.finish())
+            self._reader.account(self.lost, self.strict)
+        count, falls = self._clock.rows, self._clock.falls
+        if self.strict and count < 2:
+            raise SampleError(f"{self._where}: {count} rows of numbers; is skip_lines or header "
+                              "right?")
+        if falls:
+            line, back = self._clock.fall
+            self.remark(f"{falls} times fall back, the first in line {line} by "
                         f"{back / NANOSECONDS:.6g} s, and the samples are put in order of their "
                         "times: give time.wrap if that is a counter that began anew")
         return blocks
@@ -230,30 +315,23 @@ class TableSource(Source):
             self._reader.finish()
 
     def _blocks(self, rows: Rows) -> list[Block]:
-        if self._reader is not None and self._reader.skipped:
-            self.lost["lines that are no text, or ahead of the column names"] = self._reader.skipped
-        if not rows.lines:
-            return []
-        if self.strict:
-            return self._read(rows)
-        try:
-            return self._read(rows)
-        except SampleError:
-            pass
-        found = []
-        for line, cells in zip(rows.lines, rows.cells):
-            try:
-                found += self._read(Rows([line], [cells]))
-            except SampleError:
-                self.lose("lines that are no row of the table")
+        reader = self._reader
+        assert reader is not None
+        found = [block for part in reader.sound(rows, self._read) for block in part]
+        if not self.strict:
+            reader.account(self.lost, strict=False)
+            if reader.skipped:
+                self.lost["lines ahead of the column names"] = reader.skipped
         return found
 
     def _read(self, rows: Rows) -> list[Block]:
         reader, description = self._reader, self._description
         assert reader is not None
         columns = {name: reader.column(rows, name) for name in description.columns()}
-        stamp = self._stamps(rows)
-        return named(self._logs(stamp, columns))
+        stamp, clock = self._stamps(rows)
+        found = named(self._logs(stamp, columns))
+        self._clock = clock    # not of rows that cannot be read
+        return found
 
     def _logs(self, stamp: np.ndarray, columns: Mapping[str, np.ndarray]) -> dict[str, Log]:
         """What the rows hold, by topic; a sensor whose cells are all empty has no sample."""
@@ -295,16 +373,18 @@ class TableSource(Source):
             return values
         return values @ np.reshape(sensor.rotation, (3, 3)).T
 
-    def _stamps(self, rows: Rows) -> np.ndarray:
-        time, reader = self._description.table.time, self._reader
+    def _stamps(self, rows: Rows) -> tuple[np.ndarray, "_Clock"]:
+        """(n,) int64 ns of rows, and how the clock stands after them."""
+        time, reader, clock = self._description.table.time, self._reader, self._clock
         assert reader is not None
         if time.rate is not None:
-            since = np.round((self._count + np.arange(len(rows.lines)))
+            before = clock.rows + reader.broken    # which had their times, too
+            since = np.round((before + np.arange(len(rows.lines)))
                              * (NANOSECONDS / time.rate)).astype(np.int64)
             stamps = (since + round(time.start * NANOSECONDS)).tolist()
         else:
             stamps = reader.stamps(rows, time)
-        turns, last = self._turns, self._last
+        turns, last = clock.turns, clock.last
         if time.wrap is not None:
             length = round(time.wrap * (time.tick * NANOSECONDS if time.tick is not None
                                         else 10 ** units.TIME.get(time.unit, 9)))
@@ -314,16 +394,13 @@ class TableSource(Source):
                 stamps[k] = stamp + turns * length
         self._check(rows, stamps)
         found = np.array(stamps, dtype=np.int64)
-        back = -np.diff(found, prepend=self._latest)
-        if (back > 0).any():
-            if not self._falls:
-                k = int(np.argmax(back > 0))
-                self._fall = rows.lines[k], int(back[k])
-            self._falls += int((back > 0).sum())
-        self._latest = stamps[-1]
-        self._turns, self._last = turns, last
-        self._count += len(rows.lines)
-        return found
+        back = -np.diff(found, prepend=clock.latest)
+        fall = clock.fall
+        if (back > 0).any() and not clock.falls:
+            k = int(np.argmax(back > 0))
+            fall = rows.lines[k], int(back[k])
+        return found, _Clock(clock.rows + len(rows.lines), turns, last, stamps[-1],
+                             clock.falls + int((back > 0).sum()), fall)
 
     def _check(self, rows: Rows, stamps: list[int]) -> None:
         name = self._description.table.time.column

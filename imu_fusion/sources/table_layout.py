@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from imu_fusion.errors import SampleError
 from imu_fusion.sources import units
 from imu_fusion.sources.header import Column, column_of
-from imu_fusion.sources.source import decoded, is_number
+from imu_fusion.sources.source import BROKEN, decoded, is_number
 
 _LINES = 3000           # that are looked at
+_COMMENT = "#"
 _OTHER_UNITS = ("-", "a.u.", "local_flux", "degc", "celsius", "pa", "hpa", "kpa", "v", "mv", "%",
                 "no_units")
 
@@ -20,13 +21,14 @@ _OTHER_UNITS = ("-", "a.u.", "local_flux", "degc", "celsius", "pa", "hpa", "kpa"
 @dataclass
 class Layout:
     """``names`` are those of the description; ``labels`` and ``units`` what stands above the
-    columns, empty where nothing does; ``score``: numeric cells per line, by which the likeliest
-    way to cut is chosen."""
+    columns, empty where nothing does; ``comment`` how lines between the rows begin that are none;
+    ``score``: numeric cells per line, by which the likeliest way to cut is chosen."""
 
     score: float
     delimiter: str = ","
     decimal: str = "."
     skip: int = 0
+    comment: str | None = None
     header: bool = True
     names: list[str] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
@@ -59,11 +61,12 @@ def read_layout(data: bytes, where: str) -> Layout:
              data.removeprefix(b"\xef\xbb\xbf").split(b"\n")[:_LINES]]
     if len(data) and not data.endswith(b"\n") and len(lines) > 2:
         lines.pop()    # perhaps cut in the middle
-    best = max((_as_cut(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "space")
+    best = max((_as_cut(lines, delimiter, decimal) for delimiter in (",", ";", "\t", "|", "space")
                 for decimal in ".," if delimiter != decimal), key=lambda layout: layout.score)
     if best.score <= 0:
         raise SampleError(f"{where}: no rows of numbers are found; a table has a line for each "
                           "sample")
+    best.rows = _sound(best)
     return best
 
 
@@ -79,11 +82,23 @@ def _as_cut(lines: list[str], delimiter: str, decimal: str) -> Layout:
     first = body[0][0]
     above = [(k, cells) for k, cells in rows if k < first]
     score = float(sum(numeric[k] for k, _ in body)) / len(rows)
-    layout = Layout(score, delimiter, decimal, rows=[cells for _, cells in body])
+    comment = _COMMENT if any(line.startswith(_COMMENT) for line in lines[first:]) else None
+    layout = Layout(score, delimiter, decimal, comment=comment, rows=[cells for _, cells in body])
     _read_header(layout, above, width)
     if 2 * len(body) < len(rows) - (len(above) if layout.header else 0):
         return Layout(0.0)
     return layout
+
+
+def _sound(layout: Layout) -> list[list[str]]:
+    """The rows without those that have no number where nearly all others have one."""
+    broken: set[int] = set()
+    for k in range(len(layout.names)):
+        none = [i for i, row in enumerate(layout.rows)
+                if row[k] and not is_number(_pointed(row[k], layout.decimal))]
+        broken |= set(none if len(none) <= BROKEN * len(layout.rows) else ())
+    sound = [row for i, row in enumerate(layout.rows) if i not in broken]
+    return sound if 2 * len(sound) > len(layout.rows) else layout.rows
 
 
 def _cut(line: str, delimiter: str) -> list[str]:
@@ -91,8 +106,12 @@ def _cut(line: str, delimiter: str) -> list[str]:
     return [cell.strip().strip('"').strip() for cell in cells]
 
 
+def _pointed(text: str, decimal: str) -> str:
+    return text.replace(",", ".") if decimal == "," else text
+
+
 def _number(text: str, decimal: str) -> float:
-    text = text.replace(",", ".") if decimal == "," else text
+    text = _pointed(text, decimal)
     return float(text) if is_number(text) else np.nan
 
 

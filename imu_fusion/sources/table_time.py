@@ -43,9 +43,11 @@ def time_entry(columns: list[Column], values: dict[str, NDArray],
                texts: dict[str, list[str]]) -> TimeEntry:
     """The time column: by name or unit, else the first that rises throughout. Seconds of times
     that are written out go to ``values``."""
-    dates = [c.name for c in columns if is_calendar(texts[c.name][0])]
-    if dates:
-        return _dates(dates[0], texts[dates[0]], values)
+    for column in columns:
+        if is_calendar(texts[column.name][0]):
+            entry = _dates(column.name, texts[column.name], values)
+            if entry is not None:
+                return entry
     turns = {c.name: _turns_over(values[c.name]) for c in columns}
     rising = [c for c in columns if turns[c.name] is not None]
     named_so = [c for c in columns if not c.kind and np.isfinite(values[c.name]).any() and (
@@ -95,7 +97,7 @@ def _dates(name, texts, values):
     try:
         since = np.array([calendar(text.strip()) for text in texts], dtype=np.int64)
     except ValueError:
-        return TimeEntry(content, doubt="not all of them are times")
+        return None    # not all of them are times
     values[name] = (since - since[0]) / NANOSECONDS
     if since[0] < _SINCE_START * NANOSECONDS:
         return TimeEntry(content | {"start": EPOCH * 1e-9}, doubt="hours without a date")

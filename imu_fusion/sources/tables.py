@@ -23,6 +23,9 @@ class Tables(WholeSource):
                 continue
             table = TableSource(Description.from_mapping(found.content, part))
             more = table.feed(bytes(data), part) + table.finish()
+            self.lost += table.lost
+            for text in table.remarks:
+                self.remark(text)
             both = {b.topic for b in blocks} & {b.topic for b in more}
             if both:
                 raise SampleError(f"{part}: holds {', '.join(sorted(both))}, as another file of "

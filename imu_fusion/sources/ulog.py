@@ -7,7 +7,7 @@ to it, else they count from :data:`~imu_fusion.sources.source.EPOCH`.
 
 import contextlib
 import io
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
@@ -38,8 +38,11 @@ _GAUSS = 1e-4
 _FIX_3D = 3
 _UTC = 1_000_000_000_000_000, 9_000_000_000_000_000    # us, of a receiver that knows it
 _READS = 200_000     # more than a step back of a message takes, byte by byte
-_WANTED = ["sensor_combined", "vehicle_magnetometer", "sensor_mag", "vehicle_gps_position",
-           "sensor_gps", "vehicle_attitude"]
+_WANTED = ["sensor_combined", "sensor_accel", "sensor_gyro", "vehicle_magnetometer", "sensor_mag",
+           "vehicle_gps_position", "sensor_gps", "vehicle_attitude"]
+
+Sets = Mapping[str, Mapping[str, np.ndarray]]
+"""Fields by topic; of several sensors of a kind those of the first."""
 
 
 class _StuckError(Exception):
@@ -83,57 +86,55 @@ class Ulog(WholeSource):
             gone = sum(d.duration for d in log.dropouts) * 1e-3
             self.remark(f"the logger dropped out {len(log.dropouts)} times, {gone:.1f} s in all")
         self.device = f"PX4 {log.msg_info_dict.get('ver_hw', '')}"[:80]
-        sets: dict[str, dict[str, np.ndarray]] = {}
+        sets: dict[str, Mapping[str, np.ndarray]] = {}
         for dataset in log.data_list:
             if len(dataset.data.get("timestamp", ())):
                 sets.setdefault(dataset.name, dataset.data)
+        return self._blocks(sets, part)
+
+    def _blocks(self, sets: Sets, part: str) -> list[Block]:
+        gps = sets.get("vehicle_gps_position") or sets.get("sensor_gps")
+        missing: list[str] = []
+        blocks: list[Block] = []
         try:
-            blocks = self._blocks(sets)
-        except LookupError as error:
-            raise SampleError(f"{part}: its definitions are damaged: there is no {error}"
-                              ) from None
+            zero = self._zero(gps)
+        except LookupError:    # told where the fixes are read
+            zero = self._zero(None)
+        for read in (self._imu, _mag, _gnss, _attitude):
+            try:
+                blocks += read(sets, zero)
+            except LookupError as error:
+                missing.append(f"there is no {error}")
         if not blocks:
-            raise SampleError(f"{part}: none of {', '.join(_WANTED)} was logged")
+            raise SampleError(f"{part}: " + (
+                f"its definitions are damaged: {'; '.join(missing)}" if missing else
+                f"none of {', '.join(_WANTED)} was logged"))
+        for text in missing:
+            self.lost[f"topics whose definition is not as it should be: {text}"] += 1
         return blocks
 
-    def _blocks(self, sets: dict[str, dict[str, np.ndarray]]) -> list[Block]:
-        gps = sets.get("vehicle_gps_position") or sets.get("sensor_gps")
-        zero = self._zero(gps)
-        blocks: list[Block] = []
+    def _imu(self, sets: Sets, zero: int) -> list[Block]:
+        """Rates, with the forces at their stamps."""
         imu = sets.get("sensor_combined")
         if imu is not None:
             stamp = _stamps(imu["timestamp"], zero)
             late = imu["accelerometer_timestamp_relative"].astype(np.int64)
             there = late != _NO_FORCE
-            pairing = Pairing()
-            paired = [pairing.add(
-                ((stamp + 1000 * late)[there],
-                 (_vector(imu, "accelerometer_m_s2") * _FLU_FRD)[there]),
-                (stamp, _vector(imu, "gyro_rad") * _FLU_FRD)), pairing.finish()]
-            blocks += [block for log in paired for block in named({IMU_TOPIC: log})]
-        mag = sets.get("vehicle_magnetometer")
-        if mag is not None:
-            blocks += named({MAG_TOPIC: MagLog(_stamps(mag["timestamp"], zero), _vector(
-                mag, "magnetometer_ga") * _FLU_FRD * _GAUSS)})
-        elif "sensor_mag" in sets:
-            mag = sets["sensor_mag"]
-            values = np.column_stack([mag[axis] for axis in "xyz"]).astype(np.float64)
-            blocks += named({MAG_TOPIC: MagLog(_stamps(mag["timestamp"], zero),
-                                               values * _FLU_FRD * _GAUSS)})
-        if gps is not None:
-            blocks += _gnss(gps, zero)
-        attitude = sets.get("vehicle_attitude")
-        if attitude is not None:
-            quat = _vector(attitude, "q", 4)[:, [1, 2, 3, 0]]
-            fine = np.linalg.norm(quat, axis=1) > 0.5
-            stamp = _stamps(attitude["timestamp"], zero)[fine]
-            world, ned, body = map(scipy.spatial.transform.Rotation.from_quat,
-                                   (_ENU_NED, quat[fine], _FRD_FLU))
-            found = (world * ned * body).as_quat()
-            blocks += named({ONBOARD_TOPIC: PoseLog(stamp, found, np.zeros((len(stamp), 3)))})
-        return blocks
+            forces = (stamp + 1000 * late)[there], _vector(imu, "accelerometer_m_s2")[there]
+            rates = stamp, _vector(imu, "gyro_rad")
+        elif "sensor_accel" in sets and "sensor_gyro" in sets:
+            forces, rates = ((_stamps(data["timestamp"], zero), _xyz(data))
+                             for data in (sets["sensor_accel"], sets["sensor_gyro"]))
+        else:
+            return []
+        pairing = Pairing()
+        paired = [pairing.add((forces[0], forces[1] * _FLU_FRD), (rates[0], rates[1] * _FLU_FRD)),
+                  pairing.finish()]
+        for text in pairing.remarks():
+            self.remark(text)
+        return [block for log in paired for block in named({IMU_TOPIC: log})]
 
-    def _zero(self, gps: dict[str, np.ndarray] | None) -> int:
+    def _zero(self, gps: Mapping[str, np.ndarray] | None) -> int:
         """UTC of boot in ns."""
         if gps is not None:
             utc, boot = (gps[n].astype(np.int64) for n in ("time_utc_usec", "timestamp"))
@@ -148,12 +149,45 @@ def _stamps(boot: np.ndarray, zero: int) -> np.ndarray:
     return zero + 1000 * boot.astype(np.int64)
 
 
-def _vector(data: dict[str, Any], name: str, size: int = 3) -> np.ndarray:
+def _vector(data: Mapping[str, np.ndarray], name: str, size: int = 3) -> np.ndarray:
     return np.column_stack([data[f"{name}[{k}]"] for k in range(size)]).astype(np.float64)
 
 
-def _gnss(gps: dict[str, np.ndarray], zero: int) -> list[Block]:
+def _xyz(data: Mapping[str, np.ndarray]) -> np.ndarray:
+    return np.column_stack([data[axis] for axis in "xyz"]).astype(np.float64)
+
+
+def _mag(sets: Sets, zero: int) -> list[Block]:
+    mag = sets.get("vehicle_magnetometer")
+    if mag is not None:
+        values = _vector(mag, "magnetometer_ga")
+    elif "sensor_mag" in sets:
+        mag = sets["sensor_mag"]
+        values = _xyz(mag)
+    else:
+        return []
+    return named({MAG_TOPIC: MagLog(_stamps(mag["timestamp"], zero), values * _FLU_FRD * _GAUSS)})
+
+
+def _attitude(sets: Sets, zero: int) -> list[Block]:
+    """What the autopilot has estimated."""
+    attitude = sets.get("vehicle_attitude")
+    if attitude is None:
+        return []
+    quat = _vector(attitude, "q", 4)[:, [1, 2, 3, 0]]
+    fine = np.linalg.norm(quat, axis=1) > 0.5
+    world, ned, body = map(scipy.spatial.transform.Rotation.from_quat,
+                           (_ENU_NED, quat[fine], _FRD_FLU))
+    found = (world * ned * body).as_quat()
+    return named({ONBOARD_TOPIC: PoseLog(_stamps(attitude["timestamp"], zero)[fine], found,
+                                         np.zeros((len(found), 3)))})
+
+
+def _gnss(sets: Sets, zero: int) -> list[Block]:
     """Fixes and velocities, with the accuracies that the receiver reports."""
+    gps = sets.get("vehicle_gps_position") or sets.get("sensor_gps")
+    if gps is None:
+        return []
     stamp = _stamps(gps["timestamp"], zero)
     if "latitude_deg" in gps:    # from PX4 1.14 on
         lat, lon, height = (gps[n] for n in ("latitude_deg", "longitude_deg",

@@ -99,6 +99,7 @@ class Ximu3Csv(WholeSource):
                 **{key: {"columns": names[columns], "unit": unit, "scale": scale}
                    for key, (columns, unit, scale) in _CSV_FILES[stem].items()}}, part))
             blocks += table.feed(bytes(data), part) + table.finish()
+            self.lost += table.lost
             for text in [*table.remarks, *([_UNIT_SAID] if stem == "magnetometer" else [])]:
                 self.remark(text)
         return blocks

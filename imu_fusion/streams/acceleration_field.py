@@ -26,6 +26,7 @@ from imu_fusion.estimation.acceleration_field.rows import (
     SATURATED,
     field_at,
 )
+from imu_fusion.estimation.acceleration_field.sensor_faults import FIT_UNITS
 from imu_fusion.geometry.rotation_arrays import rotation_matrices
 from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
@@ -198,7 +199,8 @@ class AccelerationFieldStream(Stream):
         super().reset(session_topics)
 
     def restart(self) -> None:
-        self.estimator.reset()
+        # Where a clock was set the body may be in any motion.
+        self.estimator.reset(start_known=not self.restarts)
         self.matcher = self.config.make_matcher()
         self._rows: list[np.ndarray] = []
         self._asked = np.empty(0, np.int64)    # stamps of rows to come, with match.rows_of
@@ -233,12 +235,14 @@ class AccelerationFieldStream(Stream):
         any."""
         results: dict[str, Any] = {}
         fits = self.estimator.sensor_fits()
+        if fits or self._peaks:
+            results["units"] = UNITS | FIT_UNITS
         if fits:
             results["accelerometers"] = {fit.name: fit.numbers() for fit in fits}
         impact, remarks, summary = self.config.stream.impact, self.remarks(), ""
         if self._peaks:
             peaks = max(self._peaks, key=lambda found: max(found["peak_linear_acceleration"]))
-            results["units"], results["peaks"] = UNITS, peaks
+            results["peaks"] = peaks
             first = peaks["peak_linear_acceleration"][0]
             if impact.detect and not self._impacts:
                 remarks.append("no impact was measured: the linear acceleration at the first "

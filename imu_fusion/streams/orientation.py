@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 
 from imu_fusion.errors import EstimationError, ParameterError
-from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.estimator import (
+    UNITS,
+    OrientationEstimator,
+    OrientationParams,
+)
 from imu_fusion.estimation.orientation.mag_screen import MagScreen
 from imu_fusion.estimation.orientation.rows import FLAG_STILL, ORIENTATION_DTYPE
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
@@ -298,7 +302,7 @@ class OrientationStream(Stream):
         return made + self._write(self.estimator.finish())
 
     def conclude(self) -> Conclusion:
-        return Conclusion(results=self.estimator.summary())
+        return Conclusion(results={"units": UNITS} | self.estimator.summary())
 
     def change(self, params: OrientationParams) -> None:
         """Go on with other values of parameters that may change at run time."""

@@ -85,3 +85,13 @@ def test_a_long_recording_is_looked_at_in_stretches(tmp_path):
     (text,) = (f.text for f in row.findings if f.kind == "nan")
     assert text.endswith("(in 1 of 3 stretches of the recording, the first of them from stamp "
                          f"{START + 200 * 10_000_000} on)")
+
+
+def test_info_holds_samples_and_not_messages(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(30):
+            writer.write("/blob", "std_msgs/msg/String", bytes(100), START + i * 5_000_000)
+    with open_bag(tmp_path / "bag") as reader:
+        (report,) = inspect_topics(reader)
+    assert report.count == 30 and not report.stamped
+    assert np.array_equal(report.stamp, START + np.arange(30) * 5_000_000)

@@ -30,26 +30,34 @@ def same(a, b):
         for t in a)
 
 
-def ulog():
-    """A ULog of an Imu at 100 Hz and a receiver at 5 Hz (docs.px4.io, "ULog File Format")."""
-    formats = {
-        "sensor_combined": "uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;"
-                           "int32_t accelerometer_timestamp_relative;float[3] accelerometer_m_s2;"
-                           "uint32_t accelerometer_integral_dt;",
-        "vehicle_gps_position": "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;"
-                                "int32_t lon;int32_t alt_ellipsoid;float eph;float epv;"
-                                "float s_variance_m_s;float vel_n_m_s;float vel_e_m_s;"
-                                "float vel_d_m_s;uint8_t fix_type;"}
-    records = [(b"F", f"{name}:{text}".encode()) for name, text in formats.items()]
+GPS = ("vehicle_gps_position", "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;"
+       "int32_t alt_ellipsoid;float eph;float epv;float s_variance_m_s;float vel_n_m_s;"
+       "float vel_e_m_s;float vel_d_m_s;uint8_t fix_type;")
+COMBINED = ("sensor_combined", "uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;"
+            "int32_t accelerometer_timestamp_relative;float[3] accelerometer_m_s2;"
+            "uint32_t accelerometer_integral_dt;")
+APART = [(name, "uint64_t timestamp;float x;float y;float z;")
+         for name in ("sensor_gyro", "sensor_accel")]
+
+
+def ulog(apart=False):
+    """A ULog of an Imu at 100 Hz and a receiver at 5 Hz (docs.px4.io, "ULog File Format"); the Imu
+    as one topic, or as those of its two sensors, of which the accelerometer is 2 ms early."""
+    topics = [GPS, *(APART if apart else [COMBINED])]
+    records = [(b"F", f"{name}:{text}".encode()) for name, text in topics]
     records += [(b"A", struct.pack("<BH", 0, number) + name.encode())
-                for number, name in enumerate(formats)]
+                for number, (name, _) in enumerate(topics)]
     for k in range(200):
         time = 10_000 * k
-        records.append((b"D", struct.pack("<HQ3fIi3fI", 0, time, 0.1, 0.0, 0.2, 10_000, -2000,
-                                          0.0, 0.0, -9.81, 10_000)))
+        if apart:
+            records.append((b"D", struct.pack("<HQ3f", 1, time, 0.1, 0.0, 0.2)))
+            records.append((b"D", struct.pack("<HQ3f", 2, max(time - 2000, 0), 0.0, 0.0, -9.81)))
+        else:
+            records.append((b"D", struct.pack("<HQ3fIi3fI", 1, time, 0.1, 0.0, 0.2, 10_000, -2000,
+                                              0.0, 0.0, -9.81, 10_000)))
         if k % 20 == 0:
             records.append((b"D", struct.pack(
-                "<HQQ3i6fB", 1, time, 1_700_000_000_000_000 + time, 470_000_000, 110_000_000,
+                "<HQQ3i6fB", 0, time, 1_700_000_000_000_000 + time, 470_000_000, 110_000_000,
                 500_000, 1.0, 2.0, 0.3, 1.0, 0.0, 0.0, 3)))
     return MAGIC + b"\x01" + bytes(8) + b"".join(
         struct.pack("<H", len(content)) + kind + content for kind, content in records)

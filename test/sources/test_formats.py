@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import zipfile
 
@@ -18,6 +19,7 @@ from imu_fusion.sources.phyphox import PhyphoxExport, PhyphoxLive
 from imu_fusion.sources.registry import recognise
 from imu_fusion.sources.sensor_logger import SensorLoggerExport, SensorLoggerPush
 from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
+from imu_fusion.sources.ulog import Ulog
 from imu_fusion.sources.ximu3 import Ximu3, Ximu3Csv
 from test.sources.logs import read, same, together, ulog
 from test.sources.test_splitting import escaped, nmea, solution
@@ -58,6 +60,73 @@ def test_nmea_is_ellipsoidal_and_its_accuracies_come_from_gst():
     assert np.diag(fix.cov_enu[0]) == pytest.approx([9.0, 4.0, 16.0])    # east, north, up
     assert velocity.vel_world[0] == pytest.approx([10 * 1852 / 3600, 0.0, 0.0], abs=1e-9)
     assert velocity.cov_world[0, 2, 2] > 50**2    # nothing is known of the vertical
+
+
+# Types of ESF-MEAS and ESF-RAW, and what they measure: gyroscope x, y, z in 2^-12 deg/s,
+# accelerometer x, y, z in 2^-10 m/s^2, temperature.
+AXES = [kind << 24 | value * 1024 & 0xFFFFFF for kind, value in (
+    (14, 3), (13, 2), (5, 1), (16, -4), (17, 5), (18, 6), (12, 2500))]
+
+
+def test_measurements_of_a_u_blox_are_put_together_by_their_time():
+    def frame(tag, words):
+        return UBXMessage(0x10, 0x02, GET, payload=struct.pack(
+            f"<IHH{len(words)}I", tag, len(words) << 11, 0, *words)).serialize()
+
+    source = Receiver()
+    imu = read(source, frame(100, AXES[:6]) + frame(110, AXES[:3]) + frame(110, AXES[3:])
+               + frame(120, AXES[:3]) + frame(130, AXES[3:]))["imu/data_raw"]
+    assert list(imu.stamp - EPOCH) == [100_000_000, 110_000_000] and not source.lost
+    assert imu.gyr[1] == pytest.approx(np.radians([0.75, 0.5, 0.25]))
+    assert imu.acc[1] == pytest.approx([-4.0, 5.0, 6.0])
+
+
+def test_raw_readings_of_a_u_blox_keep_the_time_of_the_chip():
+    """Two samples a frame, of which the tags of 24 bits begin anew."""
+    def frame(ms, tags):
+        words = [ms, *(part for tag in tags for word in AXES for part in (word, tag))]
+        return UBXMessage(0x10, 0x03, GET, payload=struct.pack(f"<{len(words)}I", *words)
+                          ).serialize()
+
+    ticks = [2**24 - 300, 2**24 - 44, 212, 468]    # 10 ms
+    source = Receiver()
+    imu = read(source, frame(5000, ticks[:2]) + frame(5020, ticks[2:]))["imu/data_raw"]
+    assert list(imu.stamp - EPOCH) == [5_000_000_000 + 10_000_000 * k for k in range(4)]
+    assert imu.gyr[3] == pytest.approx(np.radians([0.75, 0.5, 0.25]))
+    assert imu.acc[3] == pytest.approx([-4.0, 5.0, 6.0]) and not source.lost
+    # A quarter of an hour later: the receiver's milliseconds tell how often the tags turned.
+    later = read(source, frame(900_000, [1000, 1256]))["imu/data_raw"]
+    assert list(later.stamp - EPOCH) == [900_000_000_000, 900_010_000_000]
+
+
+def gga(at):
+    return nmea(f"GPGGA,{at},4717.1,N,00833.9,E,1,08,1.0,499.6,M,48.0,M,,")
+
+
+def test_nmea_waits_for_its_date_in_a_file_and_passes_midnight():
+    rmc = "GPRMC,{},A,4717.1,N,00833.9,E,1.0,90.0,{},,,A"
+    data = (gga("235959.00") + gga("000000.00") + nmea(rmc.format("000001.00", "010125"))
+            + gga("000001.00") + gga("235959.50") + gga("000000.50"))
+    midnight = 1735689600    # 2025-01-01
+    expected = [midnight - 1, midnight, midnight + 1, midnight + 86399.5, midnight + 86400.5]
+    source = Receiver()
+    assert list(read(source, data)["fix"].stamp / 1e9) == expected and not source.lost
+    live = Receiver(strict=False)
+    assert list(read(live, data)["fix"].stamp / 1e9) == expected[2:]
+    assert sum(live.lost.values()) == 2
+
+
+def test_sentences_without_checksums_are_known_and_told(tmp_path):
+    (tmp_path / "log.txt").write_bytes(re.sub(rb"\*..", b"", gga("120000.00") + gga("120001.00")))
+    with pytest.raises(ImuFusionError, match="2 sentences of NMEA whose checksum is wrong"):
+        open_bag(tmp_path / "log.txt")
+
+
+def test_nmea_without_any_date_is_of_some_day_and_says_so():
+    source = Receiver()
+    fix = read(source, gga("120000.00") + gga("120001.00"))["fix"]
+    assert list(np.diff(fix.stamp)) == [10**9]
+    assert (fix.stamp[0] // 10**9 - 43_200) % 86_400 == 0 and "told no date" in source.remarks[-1]
 
 
 def test_nmea_beside_ubx_adds_nothing_twice():
@@ -364,10 +433,25 @@ def test_a_ulog_that_is_cut_ends(tmp_path):
         open_bag(tmp_path / "cut.ulg")
 
 
-def test_a_ulog_without_a_field_says_which(tmp_path):
-    (tmp_path / "log.ulg").write_bytes(ulog().replace(b"float[3] gyro_rad;", b"float[3] gyro_rat;"))
-    with pytest.raises(ImuFusionError, match=r"log\.ulg: .*there is no 'gyro_rad\[0\]'"):
+def test_a_ulog_without_a_field_says_which_and_keeps_the_rest(tmp_path):
+    broken = ulog().replace(b"float[3] gyro_rad;", b"float[3] gyro_rat;")
+    (tmp_path / "log.ulg").write_bytes(broken)
+    with open_bag(tmp_path / "log.ulg") as reader:
+        assert set(reader.topics) == {"/fix", "/fix_velocity"}
+        assert any("there is no 'gyro_rad[0]'" in text for text in reader.losses)
+    (tmp_path / "log.ulg").write_bytes(broken.replace(b"float eph;", b"float eps;"))
+    with pytest.raises(ImuFusionError, match=r"log\.ulg: .*'gyro_rad\[0\]'.*'eph'"):
         open_bag(tmp_path / "log.ulg")
+
+
+def test_a_ulog_of_single_sensors_is_an_imu_too():
+    combined, apart = (read(Ulog(), ulog(apart), "log.ulg") for apart in (False, True))
+    imu = apart["imu/data_raw"]
+    # The last rate has no force after it.
+    assert set(combined) == set(apart) and len(imu) == len(combined["imu/data_raw"]) > 190
+    assert list(imu.stamp) == list(combined["imu/data_raw"].stamp)
+    assert imu.gyr[7] == pytest.approx([0.1, 0.0, -0.2]) and imu.acc[7] == pytest.approx(
+        [0.0, 0.0, 9.81])
 
 
 def test_samples_whose_stamps_no_message_can_hold_are_left_out_and_counted(tmp_path):

@@ -193,12 +193,19 @@ MICROS = (2 ** 32 - 2_000_000 + np.round(1e6 * T).astype(int)) % 2 ** 32
     (written(" Week GPSTime AccX AccY AccZ GyroX GyroY GyroZ\n (sec) (m/s^2) (m/s^2) (m/s^2) "
              "(deg/s) (deg/s) (deg/s)", np.full(len(T), 2400), 3600 + T, FORCE, np.degrees(RATE),
              delimiter=" "), (315_964_800 + 2400 * 604_800 + 3600 - 18) * 10**9),
+    # As AndroSensor writes it: its own form of a date is none, and its rows may be commented on.
+    ("\n".join(["ACCELEROMETER X (m/s²)|ACCELEROMETER Y (m/s²)|ACCELEROMETER Z (m/s²)|GYROSCOPE X "
+                "(rad/s)|GYROSCOPE Y (rad/s)|GYROSCOPE Z (rad/s)|Time since start in ms |YYYY-MO-DD"
+                " HH-MI-SS_SSS", "# a mark"] + [
+        "|".join([*(f"{v:.6f}" for v in row), f"{round(1e3 * t)}",
+                  f"2026-03-04 10-00-{int(t):02d}_{round(1e3 * t) % 1000:03d}"])
+        for t, *row in zip(T, *FORCE.T, *RATE.T)]).encode() + b"\n# the end\n", EPOCH),
     # Hours without a date; the force in g beside one without gravity.
     ("\n".join(["time,ax,ay,az,gFx,gFy,gFz,wx,wy,wz,"] + [
         f"10:00:{int(t):02d}:{round(1e3 * t) % 1000:03d},0.1,0,-0.1,"
         + ",".join(f"{v:.6f}" for v in row) + "," for t, *row in zip(
             T, *(FORCE / G).T, *RATE.T)]).encode() + b"\n", EPOCH + 36_000 * 10**9)],
-    ids=["german", "counter", "units below", "gps week", "hours"])
+    ids=["german", "counter", "units below", "gps week", "date that is none", "hours"])
 def test_two_commands_suffice_for_strangers_logs(data, begins):
     description = Description.from_mapping(yaml.safe_load(sketch(data, "t.csv").to_yaml()), "d")
     source = TableSource(description)

@@ -57,6 +57,17 @@ def test_transforms_are_the_published_orientations_from_the_fixed_frame():
         assert [turn.x, turn.y, turn.z, turn.w] == values[IMU["orientation"]].tolist()
 
 
+def test_all_numbers_of_a_result_have_units():
+    stream = OrientationStream()
+    stamps = 10_000_000 * np.arange(200)
+    force = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (200, 1))
+    stream.use({IMU_TOPIC: (stamps, force), MAG_TOPIC: (stamps, np.tile([0.0, 2e-5, -4e-5],
+                                                                        (200, 1)))})
+    results = stream.conclude().results
+    numbers = {name for name, value in results.items() if isinstance(value, float)}
+    assert results["aligned"] and len(numbers) > 20 and numbers <= set(results["units"])
+
+
 def test_there_is_no_heading_to_set_before_the_first_row():
     with pytest.raises(EstimationError, match="no orientation yet"):
         OrientationStream().set_heading(0.0)

@@ -73,9 +73,12 @@ class AccelerationFieldEstimator:
         return (self.array.condition_rigid if self.params.method == "rigid_body"
                 else self.array.condition_affine)
 
-    def reset(self) -> None:
+    def reset(self, start_known: bool = True) -> None:
         """Forget all samples and start anew; ``fitted``, what the last maximum likelihood gave,
-        stays, and so does what :meth:`finish` found of the sensors."""
+        stays, and so does what :meth:`finish` found of the sensors. start_known: whether the next
+        sample is the first one, of which initial.mode given tells; else the body has to be still
+        before there are estimates again."""
+        self._waits = self.params.initial.mode == "rest" or not start_known
         self._filter: RigidBodyFilter | AffineFilter | None = None
         self._start: Start | None = None
         self._rest: np.ndarray | None = None
@@ -126,13 +129,14 @@ class AccelerationFieldEstimator:
     def get_state(self) -> dict[str, Any]:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else self._filter.get_state(),
-                "start": self._start, "rest": self._rest, "last": self._last,
+                "start": self._start, "rest": self._rest, "last": self._last, "waits": self._waits,
                 "limits": self._limits.found.copy(), "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from where :meth:`get_state` was called, in an estimator of equal parameters."""
         self._start, self._rest, self._last = state["start"], state["rest"], state["last"]
+        self._waits = state["waits"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
         self._limits.found, self._late = state["limits"].copy(), list(state["late"])
         self._filter = None
@@ -173,13 +177,13 @@ class AccelerationFieldEstimator:
         """Rows of all samples in mode smoothed, else none. Forgets the samples it smoothed.
 
         Raises:
-            EstimationError: initial.mode is rest and the body never was still.
+            EstimationError: the body never was still, as it has to be with initial.mode rest.
         """
         if self._filter is None and self._stamps:
             raise EstimationError(
-                f"initial.mode rest: the body was never still for {self.params.initial.duration} "
-                "s; give initial.orientation and initial.angular_velocity with initial.mode "
-                "given, or raise initial.still_sd")
+                f"the body was never still for {self.params.initial.duration} s, as it has to be "
+                "with initial.mode rest, and where the clock was set; give initial.orientation and "
+                "initial.angular_velocity with initial.mode given, or raise initial.still_sd")
         if self.params.mode != "smoothed":
             return np.empty(0, ROW)
         if not self._stamps:
@@ -227,7 +231,7 @@ class AccelerationFieldEstimator:
         readings = self._channels(self._limits.mark(flat))
         rows, done = [], 0
         while self._filter is None and done < len(stamp):
-            if self.params.initial.mode == "given":
+            if not self._waits:
                 self._begin()
             else:
                 rows.append(self._wait_for_rest(stamp[done:done + 1], readings[done:done + 1]))

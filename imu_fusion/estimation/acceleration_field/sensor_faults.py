@@ -18,6 +18,11 @@ _VAGUE = 0.1        # of the samples, in which the angular velocity may be hardl
 _MOSTLY = 0.5       # of the samples: an impact is wilder than what is before and after it
 
 
+FIT_UNITS = {"position_error": "m", "position_error_sd": "m", "axes_error": "rad",
+             "axes_error_sd": "rad", "residual": "1"}
+"""Units of :meth:`SensorFit.numbers`; what is not named here is a count."""
+
+
 @dataclass(frozen=True, eq=False)
 class SensorFit:
     """How one accelerometer fits to the others.

@@ -27,6 +27,15 @@ from imu_fusion.estimation.orientation.state import COUNT_NAMES, COUNTS, new_sta
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_to_rpy
 from imu_fusion.samples.logs import ImuLog, MagLog
 
+UNITS = {
+    "initial_tilt_sd_deg": "deg", "initial_heading_sd_deg": "deg", "inclination_deg": "deg",
+    "field_norm_ut": "uT", "gravity": "m/s^2", "lasting_acc_sd": "m/s^2", "gyro_delay": "s",
+    "mag_delay": "s", **{f"gyr_bias_{axis}": "rad/s" for axis in "xyz"},
+    **{f"initial_quat_{component}": "1" for component in "xyzw"},
+    **dict.fromkeys(("local_field_sd", "gyro_factor", "local_field_weight", "gyro_factor_weight",
+                     "lasting_acc_weight", "wander_tilt", "wander_heading"), "1")}
+"""Units of :meth:`OrientationEstimator.summary`; what is not named here is a count."""
+
 _CHUNK = 256
 _NO_TAPES = np.zeros(0, TAPE)
 
@@ -251,7 +260,7 @@ class OrientationEstimator:
         return int(self._state["counts"]["mag_saturated"][0] + self._counted["mag_saturated"][0])
 
     def summary(self) -> dict[str, Any]:
-        """Plain numbers and strings for diagnostics (angles in degrees, field in microtesla).
+        """Plain numbers and strings for diagnostics, in UNITS.
 
         Of the hypotheses it is the likeliest: ``local_field_sd``, ``gyro_factor`` and
         ``lasting_acc_sd``, each with the weight of all that agree. ``wander_tilt`` and
