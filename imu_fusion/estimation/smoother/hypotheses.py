@@ -79,6 +79,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if model.params.get(name) != given[name]:
             found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
+    if model.params.gnss.position_error_sd != tuple(given["gnss.position_error_sd"]):
+        found, model = _no_surer_than_stated(found, model, smooth)
     return _adapted(found, model, given)
 
 
@@ -170,12 +172,34 @@ def _wandering(found, model, name, error):
         return
     white = float(_MAD * np.median(np.abs(np.diff(left, axis=0))) / np.sqrt(2.0))
     slow = np.sqrt(np.maximum(np.mean(np.square(left), axis=0) - white ** 2, white ** 2))
-    readings = found.problem.readings
-    root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
-    sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
+    sd = slow * _sd_of_readings(found, name)
     for more in (1.0, 3.0):
         for other in _where_zero(model, {f"{error}_sd": tuple((more * sd).tolist())}):
             yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
+
+
+def _no_surer_than_stated(found, model, smooth):
+    """With errors of the fixes that are no smaller in all than the receiver states.
+
+    How fast they wander is told by the recording, an offset of all is not: the same variance
+    density, and a longer time.
+    """
+    sd = _sd_of_readings(found, "fix")
+    total = np.sum((sd / model.noise.get("fix", 1.0)) ** 2) - np.sum(sd ** 2)
+    gnss = model.params.gnss
+    longer = total / np.sum(np.square(gnss.position_error_sd))
+    if longer <= 1.0:
+        return found, model
+    return _try(found, model, model.changed({
+        "gnss.position_error_sd": tuple((np.sqrt(longer) * s for s in gnss.position_error_sd)),
+        "gnss.position_error_tau": float(longer) * gnss.position_error_tau}), smooth, -np.inf)
+
+
+def _sd_of_readings(found, name):
+    """Typical standard deviations (k,) of readings, as they count."""
+    readings = found.problem.readings
+    root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
+    return np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
 
 
 def _where_zero(model, changes):
