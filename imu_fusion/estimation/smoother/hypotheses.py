@@ -191,7 +191,7 @@ def _no_surer_than_stated(found, model, smooth):
     if longer <= 1.0:
         return found, model
     return _try(found, model, model.changed({
-        "gnss.position_error_sd": tuple((np.sqrt(longer) * s for s in gnss.position_error_sd)),
+        "gnss.position_error_sd": tuple(np.sqrt(longer) * s for s in gnss.position_error_sd),
         "gnss.position_error_tau": float(longer) * gnss.position_error_tau}), smooth, -np.inf)
 
 
