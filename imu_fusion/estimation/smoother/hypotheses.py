@@ -80,7 +80,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
             found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
     if model.params.gnss.position_error_sd != tuple(given["gnss.position_error_sd"]):
-        found, model = _no_surer_than_stated(found, model, smooth)
+        found, model = _no_surer_than_stated(found, model, given, smooth)
     return _adapted(found, model, given)
 
 
@@ -178,16 +178,17 @@ def _wandering(found, model, name, error):
             yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
 
 
-def _no_surer_than_stated(found, model, smooth):
-    """With errors of the fixes that are no smaller in all than the receiver states.
+def _no_surer_than_stated(found, model, given, smooth):
+    """With errors of the fixes that are no smaller in all than what the receiver and the parameters
+    state.
 
     How fast they wander is told by the recording, an offset of all is not: the same variance
     density, and a longer time.
     """
     sd = _sd_of_readings(found, "fix")
-    total = np.sum((sd / model.noise.get("fix", 1.0)) ** 2) - np.sum(sd ** 2)
+    stated = np.square([sd / model.noise.get("fix", 1.0), given["gnss.position_error_sd"]])
     gnss = model.params.gnss
-    longer = total / np.sum(np.square(gnss.position_error_sd))
+    longer = (stated.sum() - np.sum(sd ** 2)) / np.sum(np.square(gnss.position_error_sd))
     if longer <= 1.0:
         return found, model
     return _try(found, model, model.changed({
