@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.evaluation.orientation_error import split_angles
 from imu_fusion.parameters.file import parameters_for
 from imu_fusion.samples.logs import ImuLog, MagLog
-from imu_fusion.streams.smoother import SmoothingParams
+from imu_fusion.streams.smoother_params import SmoothingParams
 
 
 def config(name, **changes):

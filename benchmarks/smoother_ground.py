@@ -13,7 +13,7 @@ from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.estimation.smoother.params import Gnss
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.streams.smoother import SurfaceFile
+from imu_fusion.streams.smoother_params import SurfaceFile
 from imu_fusion.surfaces.file import load_surface
 
 # A site is flat to 0.3 m over its length, not anew every 10 ms: some seconds of driving.

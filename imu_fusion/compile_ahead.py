@@ -45,12 +45,10 @@ def _orientation() -> None:
 
 def _orientation_messages(imu, mag) -> None:
     """What turns rows into messages."""
+    from imu_fusion.estimation.orientation.params import OrientationParams
     from imu_fusion.messages.convert import imu_message, mag_message
-    from imu_fusion.streams.orientation import (
-        OrientationOutputParams,
-        OrientationParams,
-        OrientationStream,
-    )
+    from imu_fusion.streams.orientation import OrientationStream
+    from imu_fusion.streams.orientation_messages import OrientationOutputParams
 
     stream = OrientationStream(OrientationParams(),
                                OrientationOutputParams(remove_gravity_vector=True))
@@ -80,7 +78,7 @@ def _smoother() -> None:
 
 def _acceleration_field() -> None:
     from imu_fusion.geometry.rotation_arrays import rotation_matrices
-    from imu_fusion.streams.acceleration_field import FieldConfiguration
+    from imu_fusion.streams.acceleration_field import FieldConfiguration, messages
 
     imu, _ = _logs()
     places = {"a": [0.1, 0.0, 0.0], "b": [0.0, 0.1, 0.0], "c": [0.0, 0.0, 0.1],
@@ -93,7 +91,9 @@ def _acceleration_field() -> None:
                         ({"use_gyro": True}, imu.gyr)):
         config = FieldConfiguration.from_mapping(array | values)
         estimator = config.make_estimator()
-        rotation_matrices(estimator.run(imu.stamp, readings, gyr)["quat"])
+        rows = estimator.run(imu.stamp, readings, gyr)
+        rotation_matrices(rows["quat"])
+        messages(config, rows)
         if values.get("mode") != "smoothed":
             estimator.reset()
             for i in range(_SAMPLES):

@@ -9,16 +9,21 @@ import pytest
 from click.testing import CliRunner
 
 from imu_fusion import batch, cli
-from imu_fusion.messages.layouts import IMU
+from imu_fusion.messages.convert import imu_message, mag_message
+from imu_fusion.messages.layouts import IMU, MAG
 from imu_fusion.nodes.base import message_class
 from imu_fusion.nodes.pipeline import plan_pipeline
 from imu_fusion.nodes.replayer import ReplayerParams
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
+from imu_fusion.recordings.inspect import inspect_topics
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.contents import smoothed_of
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.trajectory_data import read_result
+from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.streams.acceleration_field import AccelerationFieldStream, read_configuration
+from imu_fusion.streams.orientation import OrientationStream
 from imu_fusion.streams.registry import STAGES
 from test.nodes.test_smoother import write as write_drive
 from test.report.test_report import Page
@@ -177,6 +182,27 @@ IN_SPACE = {"nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped", "sensor_msgs/m
             "geometry_msgs/msg/PoseWithCovarianceStamped"}
 
 
+# Keys of panels, as those of Foxglove Studio's open successor say (Lichtblick, PlotConfig,
+# RendererConfig and the map's Config); what they do not know they ignore without a word.
+PANEL_KEYS = {
+    "3D": {"followMode", "followTf", "cameraState", "scene", "topics", "transforms"},
+    "map": {"layer", "followTopic", "disabledTopics", "topicColors", "center", "zoomLevel"},
+    "Plot": {"foxglovePanelTitle", "paths", "showLegend", "isSynced", "xAxisVal", "minYValue",
+             "maxYValue", "yAxisLabel"}}
+
+
+def test_the_layout_for_foxglove_says_nothing_that_its_panels_ignore():
+    panels = json.loads((ROOT / "config" / "foxglove.json").read_text())["configById"]
+    for name, panel in panels.items():
+        assert panel.keys() <= PANEL_KEYS[name.partition("!")[0]], name
+        for path in panel.get("paths", ()):
+            assert path.keys() <= {"value", "enabled", "timestampMethod", "label", "color"}, path
+            assert path["timestampMethod"] in ("headerStamp", "receiveTime")
+    assert panels["3D!space"]["followMode"] in ("follow-pose", "follow-position", "follow-none")
+    assert any(topic["visible"] for topic in panels["3D!space"]["topics"].values())
+    assert panels["map!places"]["layer"] in ("map", "satellite", "custom")
+
+
 def test_the_layout_for_foxglove_plots_fields_that_its_messages_have():
     panels = json.loads((ROOT / "config" / "foxglove.json").read_text())["configById"]
     types = {f"/{topic}": msgtype for stage in STAGES.values()
@@ -210,3 +236,67 @@ def test_the_layout_for_foxglove_shows_topics_that_there_are():
         return {node} if isinstance(node, str) else leaves(node["first"]) | leaves(node["second"])
 
     assert leaves(layout["layout"]) == set(layout["configById"])
+
+
+AK8963 = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# What is done to rates, forces and fields (n, 3), what is said of it, and whether that is the end.
+DAMAGES = {
+    "nothing": (lambda gyr, acc, mag: (gyr, acc, mag), (), False),
+    "other units": (lambda gyr, acc, mag: (np.degrees(gyr), acc / 9.81, 1e6 * mag),
+                    ("angular velocity in deg/s", "gravity in g", "Earth's in microtesla"), True),
+    "other axes": (lambda gyr, acc, mag: (gyr, acc, mag @ AK8963.T), ("(y, x, -z)",), True),
+    "no gyroscope": (lambda gyr, acc, mag: (0.0 * gyr, acc, mag), ("exactly zero",), True)}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_what_is_wrong_with_samples_is_said_at_every_door(name, tmp_path):
+    """By info, process and the report in the same words, and by a node once it has seen enough."""
+    spoil, words, ends = DAMAGES[name]
+    imu, mag, _, _ = simulate(Tumbling(seed=3, quat_start=(0.0, 0.0, 0.0, 1.0)), 51.0, rate=100.0,
+                              sensors=Sensors(gyr_density=2e-4, acc_density=2e-3, mag_sd=3e-7))
+    rates, forces, fields = spoil(imu.gyr, imu.acc, mag.mag)
+    sent = {"imu/data_raw": [imu_message(stamp, "imu", gyr, acc)
+                             for stamp, gyr, acc in zip(imu.stamp.tolist(), rates, forces)],
+            "imu/mag": [mag_message(stamp, "imu", field)
+                        for stamp, field in zip(mag.stamp.tolist(), fields)]}
+    with BagWriter(tmp_path / "bag") as writer:
+        for (topic, cdrs), layout, log in zip(sent.items(), (IMU, MAG), (imu, mag)):
+            for stamp, cdr in zip(log.stamp.tolist(), cdrs):
+                writer.write(f"/{topic}", layout.msgtype, cdr, stamp)
+    with open_bag(tmp_path / "bag") as reader:
+        by_info = {f.text.lstrip("/") for t in inspect_topics(reader) for f in t.findings}
+    call("process", tmp_path / "bag", tmp_path / "out", code=int(ends))
+    assert (tmp_path / "out").exists() is not ends
+    call("process", tmp_path / "bag", tmp_path / "forced", "--force", "--report")
+    by_process = json.loads((tmp_path / "forced" / "results.json").read_text()).get("findings", [])
+    page = Page((tmp_path / "forced" / "report.html").read_text()).text
+    stream = OrientationStream()
+    stream.take(sent)
+    for found in (by_info, by_process, stream.findings):
+        assert all(any(word in text for text in found) for word in words), found
+        assert words or not found
+    assert by_info == set(by_process) and all(text in page for text in by_process)
+
+
+def test_accelerometers_in_g_are_told_at_every_door(tmp_path):
+    """Of an array whose axes point anywhere; that one of them hangs upside down is no remark."""
+    preset = ROOT / "config" / "head_four_accelerometers.yaml"
+    config = read_configuration(preset)
+    random = np.random.default_rng(0)
+    sent = {f"accelerometers/{name}": [
+        imu_message(5_000_000 * n, name, None,
+                    np.reshape(own.axes, (3, 3)) @ [0.0, 0.0, 1.0] + random.normal(0.0, 1e-3, 3))
+        for n in range(600)] for name, own in config.accelerometers.items()}
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic, cdrs in sent.items():
+            for n, cdr in enumerate(cdrs):
+                writer.write(f"/{topic}", IMU.msgtype, cdr, 5_000_000 * n)
+    with open_bag(tmp_path / "bag") as reader:
+        by_info = {f.text.lstrip("/") for t in inspect_topics(reader) for f in t.findings}
+    call("process", tmp_path / "bag", tmp_path / "out", "--params-file", preset)
+    by_process = json.loads((tmp_path / "out" / "results.json").read_text())["findings"]
+    stream = AccelerationFieldStream(config)
+    stream.take(sent)
+    for found in (by_info, by_process, stream.findings):
+        assert len(found) == 4 and all("which is gravity in g" in text for text in found)
+    assert by_info == set(by_process)

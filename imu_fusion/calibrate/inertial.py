@@ -78,10 +78,13 @@ def calibrate_recorded_gyroscope(bag: str | Path, topic: str = _IMU,
     except CalibrationError as error:
         remarks.append(f"forces are used as recorded ({error})")
     time = seconds(imu.stamp, imu.stamp[0])
-    still = np.concatenate([imu.gyr[r.start:r.stop] for r in rests])
+    still = [imu.gyr[r.start:r.stop] for r in rests]
+    means = np.array([rates.mean(axis=0) for rates in still])
     turns = [Turn(time[a.stop:b.start], imu.gyr[a.stop:b.start], force[a.start:a.stop].mean(axis=0),
                   force[b.start:b.stop].mean(axis=0)) for a, b in zip(rests, rests[1:])]
-    found = calibrate_gyroscope(turns, still.mean(axis=0),
+    # From rest to rest the offset wanders by more than the noise of a mean.
+    found = calibrate_gyroscope(turns, np.concatenate(still).mean(axis=0),
+                                means.std(axis=0) / np.sqrt(len(rests)),
                                 None if angle_deg is None else np.radians(angle_deg))
     if angle_deg is None:
         remarks.append("no angle is known (--angle): the scale rests on turns about axes that are "

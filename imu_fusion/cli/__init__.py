@@ -29,8 +29,9 @@ def cli(max_chunk_mb: float | None) -> None:
 
 for command in (
         files.info, files.convert, files.describe, estimates.process, estimates.pipeline,
-        estimates.report, files.export, files.avaframe, estimates.lengths, calibrations.calibrate,
-        files.translate, nodes.run, nodes.play, nodes.record, nodes.demo, nodes.compile_kernels):
+        estimates.report, files.export, files.avaframe, estimates.radar,
+        estimates.lengths, calibrations.calibrate, files.translate, nodes.run, nodes.play,
+        nodes.record, nodes.demo, nodes.compile_kernels):
     cli.add_command(command)
 
 

@@ -1,4 +1,4 @@
-"""Commands that estimate and tell of estimates: process, pipeline, report, lengths."""
+"""Commands that estimate and tell of estimates: process, pipeline, report, radar, lengths."""
 
 import sys
 from pathlib import Path
@@ -163,6 +163,38 @@ def _write_report(bag, estimates, path, params_file, remap, figures=None, form="
         for file in write_figures(written.sections, figures, form):
             click.echo(f"written: {file}")
     return written.complete
+
+
+@click.command()
+@click.argument("bag", type=click.Path())
+@click.option("--place", type=float, nargs=3, required=True, metavar="LAT LON HEIGHT",
+              help="Where the radar stands: degrees, and m in the datum of the fixes.")
+@click.option("--gates", type=click.Path(), metavar="FILE.csv",
+              help="What it saw: columns of time, range (m) and velocity (m/s).")
+@click.option("--gate-length", type=click.FloatRange(min=0.1), default=25.0, show_default=True,
+              help="Of a range gate, m.")
+@click.option("--along-beam", is_flag=True,
+              help="Its velocities are those along the beam: project them on the slope.")
+@click.option("--surface", type=click.Path(), metavar="FILE",
+              help="Terrain, whose heights are taken in place of the trajectory's.")
+@click.option("--out", type=click.Path(), default="radar.html", show_default=True)
+def radar(bag: str, place: tuple[float, float, float], gates: str | None, gate_length: float,
+          along_beam: bool, surface: str | None, out: str) -> None:
+    """Compare the trajectory in BAG with a Doppler radar's range gates.
+
+    BAG is what `process` has written, or a recording of fixes with velocities. Writes a
+    range-time diagram, and velocities against the way down the slope with the gates projected on
+    it.
+    """
+    from imu_fusion.recordings.targets import refuse_files
+    from imu_fusion.report.radar import write_radar_report
+    refuse_files([bag, gates], out)
+    table = Table("trajectory and radar", "")
+    for row in write_radar_report(bag, place, out, gates, gate_length, along_beam,
+                                  surface):
+        table.add_row(*row)
+    console.print(table)
+    click.echo(f"written: {out}")
 
 
 @click.command()

@@ -12,7 +12,7 @@ from imu_fusion.evaluation.consistency import nees
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.streams.smoother import FIX_TOPIC, VELOCITY_TOPIC
+from imu_fusion.streams.stream import FIX_TOPIC, VELOCITY_TOPIC
 
 # The drive: its stretches without GNSS, s, as in benchmarks/smoother_drive.py.
 _LENGTH, _COUNT, _FIRST, _LAST = 15.0, 11, 60.0, -45.0

@@ -13,7 +13,7 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.recording import write_recording_report
 from imu_fusion.report.smoother import Smoothed
-from imu_fusion.streams.smoother import SMOOTHED_FIX_TOPIC
+from imu_fusion.streams.smoother_messages import SMOOTHED_FIX_TOPIC
 
 
 def replay_and_smooth(bag: Path, out: Path, params_file: ParamsFile, console: Console) -> Smoothed:

@@ -20,7 +20,17 @@ from imu_fusion.errors import TopicError
 from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.geometry.rotation_arrays import rpy_angles
 from imu_fusion.kernels import njit
-from imu_fusion.messages.layouts import FIX, IMU, MAG, POSE, TWIST, VECTOR3, Layout
+from imu_fusion.messages.layouts import (
+    FIX,
+    IMU,
+    LITTLE,
+    MAG,
+    POSE,
+    TWIST,
+    VECTOR3,
+    Layout,
+    string,
+)
 from imu_fusion.samples import AttitudeLog, FixLog, ImuLog, MagLog, PoseLog, VelocityLog
 from imu_fusion.samples.logs import Log
 
@@ -29,10 +39,8 @@ ABSENT = np.zeros((3, 3))
 ABSENT[0, 0] = -1.0
 _COVARIANCE_KNOWN = 3
 
-# Columns of a decoded Imu: what is measured, and the first elements of its covariances.
-_MEASURED = np.r_[IMU["angular_velocity"], IMU["linear_acceleration"]]
-_ABSENT = np.array([IMU[f"{field}_covariance"].start
-                    for field in ("angular_velocity", "linear_acceleration")])
+# Of a decoded Imu: the first elements of the covariances of rates and specific force.
+_FIRST_COVARIANCES = slice(IMU["angular_velocity_covariance"].start, None, 12)
 
 
 def imu_message(stamp: int, frame_id: str, gyr: ArrayLike | None, acc: ArrayLike | None,
@@ -151,7 +159,7 @@ def rpy_messages(rows: np.ndarray, frame_id: str) -> list[bytes]:
 
 def bool_message(value: bool) -> bytes:
     """CDR bytes of a std_msgs/Bool."""
-    return b"\x00\x01\x00\x00\x01" if value else b"\x00\x01\x00\x00\x00"
+    return LITTLE + bytes([value])
 
 
 def bool_value(cdr: bytes) -> bool:
@@ -161,8 +169,7 @@ def bool_value(cdr: bytes) -> bool:
 
 def string_message(text: str) -> bytes:
     """CDR bytes of a std_msgs/String."""
-    data = text.encode() + b"\0"
-    return b"\x00\x01\x00\x00" + struct.pack("<I", len(data)) + data
+    return LITTLE + string(text)
 
 
 def string_value(cdr: bytes) -> str:
@@ -172,26 +179,28 @@ def string_value(cdr: bytes) -> str:
 
 
 def imu_values(values: np.ndarray) -> np.ndarray:
-    """Rates and specific force (..., 6) of decoded sensor_msgs/Imu values, NaN where absent."""
-    result = values[..., _MEASURED]
-    absent = values[..., _ABSENT] == -1.0
-    if absent.any():
-        result[np.repeat(absent, 3, axis=-1)] = np.nan
-    return result
+    """Rates and specific force (n, 6) of decoded sensor_msgs/Imu values, NaN where absent."""
+    return _measured(values, np.nan)
 
 
 def gyroscope_first_values(values: np.ndarray) -> np.ndarray:
     """As imu_values, but specific force is zero where absent: a gyroscope alone is enough."""
-    result = imu_values(values)
-    absent = values[..., _ABSENT[1]] == -1.0
+    return _measured(values, 0.0)
+
+
+def _measured(values, absent_force):
+    result = np.concatenate([values[:, IMU["angular_velocity"]],
+                             values[:, IMU["linear_acceleration"]]], axis=1)
+    absent = values[:, _FIRST_COVARIANCES] == -1.0
     if absent.any():
-        result[absent, 3:] = 0.0
+        result[absent[:, 0], :3] = np.nan
+        result[absent[:, 1], 3:] = absent_force
     return result
 
 
 def mag_values(values: np.ndarray) -> np.ndarray:
-    """Field (..., 3) of decoded sensor_msgs/MagneticField values."""
-    return values[..., MAG["magnetic_field"]]
+    """Field (n, 3) of decoded sensor_msgs/MagneticField values."""
+    return np.ascontiguousarray(values[:, MAG["magnetic_field"]])
 
 
 def fix_values(values: np.ndarray) -> np.ndarray:

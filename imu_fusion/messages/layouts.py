@@ -9,7 +9,7 @@ middleware; anything else is refused.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +17,11 @@ import numpy as np
 from imu_fusion.errors import MessageError
 
 NANOSECONDS = 1_000_000_000
-_LITTLE = b"\x00\x01\x00\x00"
+LITTLE = b"\x00\x01\x00\x00"
+"""The encapsulation of plain CDR, little endian."""
+
 _STAMP = struct.Struct("<iI")
-_STRINGS = 12    # where they begin: behind encapsulation and stamp
+_STAMP_AT, _STRINGS = 4, 12    # where they begin
 _KNOWN = 64      # shapes and templates that are kept: strings come from outside
 
 
@@ -84,7 +86,7 @@ class Layout:
             ("doubles", "d", (position - len(before),), slice(len(before), position)),
             *((f"after{k}", code, (), position + k) for k, code in enumerate(after))]
         self._latest: _Shape | None = None
-        self._shapes: dict[tuple[int, bytes, bytes], _Shape] = {}
+        self._shapes: list[_Shape] = []
         self._templates: dict[tuple[str, str], tuple[bytes, np.dtype]] = {}
 
     def __getitem__(self, field: str) -> slice:
@@ -135,7 +137,7 @@ class Layout:
                 shape = self._latest
                 if shape is None or not shape.fits(cdr):
                     shape = self._latest = self._shape(bytes(cdr))
-                sec, nanosec = shape.stamp.unpack_from(cdr, 4)
+                sec, nanosec = shape.stamp.unpack_from(cdr, _STAMP_AT)
                 if nanosec >= NANOSECONDS:
                     raise MessageError(f"{self.msgtype}: a stamp with {nanosec} ns")
             except MessageError as error:
@@ -172,21 +174,15 @@ class Layout:
         bytes."""
         key = (frame_id, child_frame_id)
         template, record = self._templates.get(key) or self._template(*key)
-        room = bytearray(template * len(stamp))
-        rows = np.frombuffer(room, record)
-        for i, nanoseconds in enumerate(stamp.tolist()):
-            _STAMP.pack_into(room, i * len(template) + 4, *divmod(nanoseconds, NANOSECONDS))
-        for name, _, _, column in self._fields:
-            rows[name] = values[:, column]
-        data, size = bytes(room), len(template)
-        return [data[i:i + size] for i in range(0, len(data), size)]
+        return alike(template, record, _STAMP_AT, stamp,
+                     {name: values[:, column] for name, _, _, column in self._fields})
 
     def _template(self, frame_id: str, child_frame_id: str) -> tuple[bytes, np.dtype]:
         """A message of zeros, and where its numbers are."""
-        strings = _string(frame_id)
+        strings = string(frame_id)
         if self.child:
-            strings = _pad(strings, 4) + _string(child_frame_id)
-        begin = _LITTLE + bytes(_STRINGS - 4) + strings
+            strings = padded(strings, 4) + string(child_frame_id)
+        begin = LITTLE + bytes(_STRINGS - 4) + strings
         record = self._record("<", len(begin))
         made = begin.ljust(record.itemsize, b"\0"), record
         if len(self._templates) < _KNOWN:
@@ -195,6 +191,9 @@ class Layout:
 
     def _shape(self, cdr: bytes) -> _Shape:
         """The shape of a message, or MessageError."""
+        for shape in self._shapes:
+            if shape.fits(cdr):
+                return shape
         if len(cdr) < 16 or cdr[0] != 0 or cdr[1] not in (0, 1):
             raise MessageError(f"{self.msgtype}: {len(cdr)} bytes that do not start as plain CDR")
         order = "<" if cdr[1] == 1 else ">"
@@ -205,14 +204,11 @@ class Layout:
         if self.child and _aligned(end, 4) + 4 <= len(cdr):
             start = _aligned(end, 4)
             end = start + 4 + struct.unpack_from(order + "I", cdr, start)[0]
-        key = (len(cdr), cdr[:2], cdr[_STRINGS:end])
-        shape = self._shapes.get(key)
-        if shape is None:
-            record = self._record(order, end, len(cdr))
-            shape = _Shape(*key, end, cdr[16:first - 1].decode("utf-8", "replace"),
-                           struct.Struct(order + "iI"), record)
-            if len(self._shapes) < _KNOWN:
-                self._shapes[key] = shape
+        shape = _Shape(len(cdr), cdr[:2], cdr[_STRINGS:end], end,
+                       cdr[16:first - 1].decode("utf-8", "replace"), struct.Struct(order + "iI"),
+                       self._record(order, end, len(cdr)))
+        if len(self._shapes) < _KNOWN:
+            self._shapes.append(shape)
         return shape
 
     def _record(self, order: str, end: int, size: int | None = None) -> np.dtype:
@@ -235,11 +231,32 @@ def _aligned(position, size):
     return 4 - (4 - position) // size * size
 
 
-def _pad(data, size):
+def alike(template: bytes, record: np.dtype, stamp_at: int, stamp: np.ndarray,
+          columns: Mapping[str, np.ndarray]) -> list[bytes]:
+    """CDR bytes of n messages that differ in stamp and numbers.
+
+    Args:
+        template: one of them, little endian.
+        record: structured dtype as long, with the fields of ``columns``, which are of n elements.
+        stamp_at: place of the stamp; stamp: (n,) int64 ns.
+    """
+    room, size = bytearray(template * len(stamp)), len(template)
+    for i, nanoseconds in enumerate(stamp.tolist()):
+        _STAMP.pack_into(room, i * size + stamp_at, *divmod(nanoseconds, NANOSECONDS))
+    rows = np.frombuffer(room, record)
+    for name, values in columns.items():
+        rows[name] = values
+    data = bytes(room)
+    return [data[i:i + size] for i in range(0, len(data), size)]
+
+
+def padded(data: bytes, size: int) -> bytes:
+    """Zeros up to the next multiple of ``size``."""
     return data + b"\0" * (-len(data) % size)
 
 
-def _string(text):
+def string(text: str) -> bytes:
+    """A string as it stands in CDR: its length, then UTF-8 with a zero at its end."""
     data = text.encode("utf-8") + b"\0"
     return struct.pack("<I", len(data)) + data
 

@@ -82,9 +82,7 @@ class EstimatorNode(Node):
     def publish(self, made: Iterable[Messages]) -> None:
         """Publish what the stream has made."""
         for part in made:
-            output = self._outputs[part.topic]
-            for cdr in part.cdrs:
-                output.publish(cdr)
+            self._outputs[part.topic].publish(*part.cdrs)
 
     def stop(self) -> None:
         """End the session, so that whoever listens knows."""

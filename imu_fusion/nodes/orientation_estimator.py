@@ -8,12 +8,8 @@ import yaml
 
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.nodes.estimator import EstimatorNode
-from imu_fusion.streams.orientation import (
-    OrientationOutputParams,
-    OrientationStream,
-    outputs_of,
-    warm_up,
-)
+from imu_fusion.streams.orientation import OrientationStream, warm_up
+from imu_fusion.streams.orientation_messages import OrientationOutputParams, outputs_of
 from imu_fusion.streams.stream import EstimatorNodeParams
 
 

@@ -20,7 +20,7 @@ from imu_fusion.recordings.results import UNDECODABLE, left_out, write_results
 from imu_fusion.recordings.targets import refuse_source
 from imu_fusion.samples.guard import guard_log
 from imu_fusion.streams.registry import STAGES
-from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
+from imu_fusion.streams.smoother_messages import RESULTS_TOPIC, results_value
 from imu_fusion.streams.stage import Stage
 
 SMOOTHER = "smoother"

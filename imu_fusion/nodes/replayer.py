@@ -297,7 +297,7 @@ class Replayer(Node):
         text = ""
         if self._phase == self._wait:
             text = "waiting for subscribers"
-        elif self._phase != self._play or (sent == self._told_at and not self._source.ready()):
+        elif self._phase != self._play or (sent == self._told_at and self._source.is_shut()):
             text = self._source.waiting_for()
         elif p.rate == 0.0 and self._source.foreign and p.foreign_rate:
             names = sorted({n for names in self._source.foreign.values() for n in names})

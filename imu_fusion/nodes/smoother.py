@@ -23,17 +23,10 @@ from imu_fusion.nodes.base import IDLE
 from imu_fusion.nodes.estimator import EstimatorNode
 from imu_fusion.nodes.flow import END, NAP_PATIENT, reliable_qos
 from imu_fusion.signals import end_after
-from imu_fusion.streams import smoother as smoothing
-from imu_fusion.streams.smoother import (
-    INPUTS,
-    ONCE,
-    SmootherNodeParams,
-    SmootherStream,
-    SmoothingParams,
-    outputs_of,
-    required_of,
-)
-from imu_fusion.streams.stream import EstimatorNodeParams, one_by_one
+from imu_fusion.streams.smoother import INPUTS, SmootherStream, required_of, smooth
+from imu_fusion.streams.smoother_messages import ONCE, Outcome, messages, outputs_of
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
+from imu_fusion.streams.stream import IMU_TOPIC, EstimatorNodeParams, one_by_one
 from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
@@ -52,13 +45,13 @@ def _smooth_in_child(folder):
     assert parent is not None
     end_after(parent.join)
     folder = Path(folder)
-    outcome: smoothing.Outcome | str
+    outcome: Outcome | str
     try:
         params, logs = pickle.loads((folder / _INPUT).read_bytes())
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
-            result = smoothing.smooth(params, logs)
+            result = smooth(params, logs)
         np.save(folder / _SAMPLES, result.samples)
-        outcome = smoothing.Outcome.of(result, logs[smoothing.IMU_TOPIC].frame_id)
+        outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
     except ImuFusionError as error:
         outcome = str(error)
     except KeyboardInterrupt:
@@ -226,7 +219,7 @@ class SmootherNode(EstimatorNode):
             for topic, output in self._outputs.items():
                 output.renew(_latched(1 if topic in ONCE else len(samples)))
             self._source.begin()
-            made = smoothing.messages(samples, outcome, self.params(SmoothingParams))
+            made = messages(samples, outcome, self.params(SmoothingParams))
             self._messages = itertools.chain.from_iterable(map(one_by_one, made))
         if self._messages is None:
             return False

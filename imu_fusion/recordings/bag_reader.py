@@ -106,7 +106,7 @@ def open_bag(path: str | Path, description: str | Path | None = None,
 
 class Reader:
     """A recording; ``warnings`` says what is wrong with it, as far as it is known by now: what is
-    damaged inside is found while it is read. ``damaged`` tells whether anything is lost,
+    damaged inside is found while it is read. ``losses`` are those of them that cost messages,
     ``format`` what a device's file was taken for. ``recorded`` maps topics that go by another name
     to the one in the recording."""
 
@@ -115,7 +115,7 @@ class Reader:
         self.topics: dict[str, TopicInfo] = {}
         self.start_time = self.end_time = 0
         self.warnings: list[str] = []
-        self.damaged = False    # messages are lost
+        self.losses: list[str] = []
         self.format = ""
         self.recorded: dict[str, str] = {}
         self._nested: dict[str, tuple[str, Nested]] = {}    # topic.field: (topic, what is there)
@@ -346,13 +346,14 @@ class Reader:
                            f"{info.msgtype} in other files; read as the latter")
 
     @property
-    def losses(self) -> list[str]:
-        """What is wrong with it, if anything is lost; as far as is known by now."""
-        return list(self.warnings) if self.damaged else []
+    def damaged(self) -> bool:
+        """Whether messages are lost, as far as is known by now."""
+        return bool(self.losses)
 
     def lose(self, text: str) -> None:
         """Say, once, that a part of the recording cannot be used."""
-        self.damaged = True
+        if shown(text) not in self.losses:
+            self.losses.append(shown(text))
         self.mention(text)
 
     def mention(self, text: str) -> None:

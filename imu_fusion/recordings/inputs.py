@@ -44,5 +44,9 @@ def _instead(reader: Reader, topic: str, msgtype: str) -> str:
     if fitting:
         return (f"of that type it has {', '.join(fitting)}: add "
                 f"--remap {topic}:={fitting[0]}")
-    others = ", ".join(f"{t.name} ({t.msgtype})" for t in reader.topics.values())
-    return f"it has {others or 'no topics'}"
+    held = [t for t in reader.topics.values() if t.count]
+    others = [f"{t.name} ({t.msgtype})" for t in held
+              if not t.name.lstrip("/").startswith(ARRAY_TOPIC)]
+    if not others and held:
+        return "it has accelerometers of an array"
+    return f"it has {', '.join(others) or 'no messages'}"

@@ -8,8 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import EstimationError, ImuFusionError, LayoutError
-from imu_fusion.estimation.avalanche.dead_reckoning import BallSamples, dead_reckon
+from imu_fusion.errors import CalibrationError, EstimationError, ImuFusionError, LayoutError
+from imu_fusion.estimation.avalanche.dead_reckoning import BallSamples
 from imu_fusion.estimation.avalanche.descent import Descent, read_descent
 from imu_fusion.estimation.avalanche.field_check import angles_deg
 from imu_fusion.estimation.avalanche.phases import NAMES
@@ -20,6 +20,7 @@ from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_worl
 from imu_fusion.report import figures as fig
 from imu_fusion.report.figures import Band, Line, Panel, Shade, time_figure
 from imu_fusion.report.html import Block, Figure, Section, Table, Text
+from imu_fusion.report.in_situ import Reckoned, in_situ_blocks, reckon
 from imu_fusion.report.overview import number
 from imu_fusion.report.smoother import Smoothed
 from imu_fusion.report.trajectory import thinned
@@ -84,6 +85,13 @@ class Slope:
                                                              self.since(b.time)),),
                            _COLORS[a.number], 0.16) for a, b in zip(found, found[1:]))
 
+    @property
+    def flight_shades(self) -> tuple[Shade, ...]:
+        """The ballistic flights."""
+        return (Shade("ballistic flight", tuple(
+            (self.since(f.start), self.since(f.end)) for f in self.descent.flights),
+            _COLORS[2], 0.4),)
+
     def row(self, time: float) -> int:
         """The sample of the motion at a time (s) after the entrainment."""
         return int(np.clip(np.searchsorted(self.descent.time, time), 0, len(self.descent.time) - 1))
@@ -111,14 +119,15 @@ def slope_of(smoothed: Smoothed, raw: ImuLog) -> Slope | None:
 
 def slope_section(slope: Slope, mag: MagLog | None) -> Section:
     """The section; ``mag``: MagLog as recorded, or None."""
+    reckoned = _reckoned(slope)
     blocks: list[Block] = [
         Text("The slope frame: longitudinal down the fall line, lateral to the left seen "
              "downwards, transverse away from the slope. All is of the ball's centre, counted from "
              "the entrainment."),
         _phase_table(slope), *_flight_table(slope),
-        Figure(_side_view(slope), "From the side, at one scale: the terrain below the ball, where "
-               "the ball was, and where its sensors alone would have it, before what terrain and "
-               "fixes say of them.", linked=False),
+        Figure(_side_view(slope, reckoned), "From the side, at one scale: the terrain below the "
+               "ball, where the ball was, and where its sensors alone would have it, before and "
+               "after their calibration by the terrain.", linked=False),
         Figure(_map(slope), f"From above the slope: tube of {_TUBE:.0f}σ.", linked=False),
         Figure(time_figure(_velocity(slope), slope.shades, 150),
                "Velocity in the slope frame; the phases are shaded."),
@@ -126,15 +135,17 @@ def slope_section(slope: Slope, mag: MagLog | None) -> Section:
                "Rotation vector since the entrainment (23), each the nearest to the one before: "
                "where a wobbling ball passes a whole turn beside its axis, none is near. Turns, "
                "and the rates as recorded and with what was recovered beyond the range."),
-        Figure(time_figure(_forces(slope), slope.shades, 150),
+        Figure(time_figure(_forces(slope), slope.flight_shades, 150),
                "Specific force of the ball's centre. In free flight it is zero: those spans are "
-               "what the table of flights lists.")]
+               "shaded, and the table of flights lists them.")]
     if mag is not None and len(mag):
         blocks.append(Figure(
             time_figure(_field(slope, mag), slope.shades, 150),
             "The field as the attitudes carry it into the world, and the lines of the World "
             "Magnetic Model. This check (25)-(27) is blind to a turn about the field, which is "
             "most of the heading where the field is steep."))
+    if reckoned is not None:
+        blocks += in_situ_blocks(reckoned)
     return Section("On the slope", tuple(blocks))
 
 
@@ -171,9 +182,9 @@ def _arch(path):
     return float(np.max(path[:, 2] - path[0, 2] - share * (path[-1, 2] - path[0, 2])))
 
 
-def _reckoned(slope):
-    """Positions (k, 3) m in the slope frame by the sensors alone, (18)-(21), up to the first gap:
-    forces as recorded, their norm at rest as gravity."""
+def _reckoned(slope) -> Reckoned | None:
+    """Dead reckoning by the sensors alone, (18)-(21), up to the first gap, with forces as recorded
+    and as the terrain calibrates them; None where that is too short."""
     start, step = slope.rows.start, np.diff(slope.smoothed.result.samples["stamp"][slope.rows])
     gaps = np.flatnonzero(step > _GAP * np.median(step))
     part = slice(start, start + int(gaps[0]) + 1 if len(gaps) else slope.rows.stop)
@@ -182,12 +193,14 @@ def _reckoned(slope):
     rest = slice(slope.descent.motion.rest_start, start)
     _, still, _ = np.intersect1d(slope.raw.stamp, slope.smoothed.result.samples["stamp"][rest],
                                  return_indices=True)
-    track = dead_reckon(BallSamples(
-        seconds(samples["stamp"][ours], int(samples["stamp"][0])),
-        samples["quat_world_imu"][ours], slope.raw.acc[own], samples["gyr"][ours],
-        -np.array(slope.smoothed.params.surface.lever_arm)),
-        float(np.linalg.norm(slope.raw.acc[still].mean(axis=0))))
-    return slope.in_slope(track.position)
+    try:
+        return reckon(BallSamples(
+            seconds(samples["stamp"][ours], int(samples["stamp"][0])),
+            samples["quat_world_imu"][ours], slope.raw.acc[own], samples["gyr"][ours],
+            -np.array(slope.smoothed.params.surface.lever_arm)), slope.axes, slope.gravity,
+            float(np.linalg.norm(slope.raw.acc[still].mean(axis=0))))
+    except CalibrationError:
+        return None
 
 
 def _path(points, name, color, **line):
@@ -196,7 +209,7 @@ def _path(points, name, color, **line):
                       line=dict(color=color, width=2, **line))
 
 
-def _side_view(slope):
+def _side_view(slope, reckoned):
     """Horizontal distance along the fall line against height."""
     down = np.linalg.norm(slope.axes[:2, 0]), slope.axes[2, 0]
     out = np.hypot(*slope.axes[:2, 2]), slope.axes[2, 2]
@@ -207,9 +220,12 @@ def _side_view(slope):
 
     (place,) = thinned(slope.position)
     figure = go.Figure([_path(_terrain(slope), "terrain", fig.REFERENCE, dash="dot"),
-                        _path(section(_reckoned(slope)), "sensors alone, before calibration",
-                              fig.HIGHLIGHT, dash="dash"),
                         _path(section(place), "smoothed", fig.ESTIMATE)])
+    if reckoned is not None:
+        for place, name, color in ((reckoned.before, "before", fig.HIGHLIGHT),
+                                   (reckoned.after, "after", fig.SECONDARY)):
+            figure.add_trace(_path(section(place), f"sensors alone, {name} calibration", color,
+                                   dash="dash"))
     return _scaled(figure, "distance along the fall line in m", "height in m", slope, section)
 
 

@@ -22,7 +22,7 @@ from imu_fusion.report.trajectory_data import read_result
 from imu_fusion.samples import AttitudeLog
 from imu_fusion.samples.guard import usable_part
 from imu_fusion.samples.logs import Log
-from imu_fusion.streams.orientation import BIAS_TOPIC, FLAGS_TOPIC
+from imu_fusion.streams.orientation_messages import BIAS_TOPIC, FLAGS_TOPIC
 from imu_fusion.streams.stage import StageReport
 from imu_fusion.surfaces.file import load_surface
 

@@ -6,6 +6,7 @@ once. What is read is what the sections use: lines, markers, filled bands, shade
 
 import html
 import re
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,10 @@ from imu_fusion.report.html import Figure, Section
 COLUMN_WIDTH = 3.5      # inches: 89 mm, a column of most journals
 _PANEL, _REST = 0.95, 0.65    # inches of height: of a panel over time, of legend and labels
 _POINTS = 6.5           # of the text
+_LETTERS, _HANDLE = 58, 5     # that a column is wide, and that stand for a line in a legend
 _LINE = 0.6             # points of a line for each of plotly's pixels
 _STYLES = {"solid": "-", "dot": ":", "dash": "--", "dashdot": "-."}
-_SETTINGS: Any = {
+SETTINGS: Any = {
     "font.size": _POINTS, "axes.linewidth": 0.5, "xtick.major.width": 0.5,
     "ytick.major.width": 0.5, "xtick.major.size": 2.0, "ytick.major.size": 2.0,
     "svg.fonttype": "none", "pdf.fonttype": 42, "text.parse_math": False, "savefig.dpi": 600}
@@ -53,7 +55,7 @@ def write_figures(sections: Sequence[Section], folder: str | Path, form: str = "
             stem = re.sub(r"[^a-z0-9]+", "_", section.title.lower()).strip("_")
             for number, figure in enumerate(figures, 1):
                 file = Path(folder) / f"{stem}{f'_{number}' if len(figures) > 1 else ''}.{form}"
-                with rc_context(_SETTINGS):
+                with rc_context(SETTINGS):
                     draw(figure).savefig(file)
                 written.append(file)
     except OSError as error:
@@ -109,8 +111,9 @@ def _draw_markers(canvas, panel, trace, places, label):
     """``places``: x, y and perhaps z, (n,) each."""
     marker = trace.marker
     of_speed = marker.color is not None and not isinstance(marker.color, str)
+    size = float(np.clip(600.0 / max(len(places[0]), 1), 1.5, 6.0))    # few are to be seen, too
     shown = panel.scatter(
-        *places, s=1.5, c=marker.color if marker.color is not None else trace.line.color,
+        *places, s=size, c=marker.color if marker.color is not None else trace.line.color,
         cmap="viridis" if of_speed else None, label=label, linewidths=0.0, rasterized=True,
         alpha=marker.opacity)
     if of_speed and marker.colorbar.title.text:
@@ -149,8 +152,20 @@ def _draw_legend(canvas, panels):
         for handle, label in zip(*panel.get_legend_handles_labels()):
             entries.setdefault(label, handle)
     if entries:
-        canvas.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=3,
-                      frameon=False, handlelength=1.4, columnspacing=1.0)
+        columns = _legend_columns(list(entries))
+        # Columns are filled one by one; read they are in rows.
+        order = [i for column in range(columns) for i in range(column, len(entries), columns)]
+        labels = [textwrap.fill(label, _LETTERS - _HANDLE) for label in entries]
+        canvas.legend(*([kind[i] for i in order] for kind in (list(entries.values()), labels)),
+                      loc="outside upper center", ncols=columns, frameon=False, handlelength=1.4,
+                      columnspacing=1.0, markerscale=2.0)
+
+
+def _legend_columns(labels: list[str]) -> int:
+    """As many columns as stand beside each other."""
+    return next((columns for columns in (3, 2) if sum(
+        _HANDLE + max(map(len, labels[column::columns]), default=0)
+        for column in range(columns)) <= _LETTERS), 1)
 
 
 def _draw_space(figure, traces):
@@ -168,7 +183,7 @@ def _draw_space(figure, traces):
             panel.plot(*places, color=colour, linewidth=0.8, label=label)
         elif "lines" in mode:
             shown = panel.scatter(*places, s=1.0, c=colour, cmap="viridis", label=label)
-            canvas.colorbar(shown, ax=panel, shrink=0.5, pad=0.12,
+            canvas.colorbar(shown, ax=panel, shrink=0.5, pad=0.2,
                             label=trace.line.colorbar.title.text)
         if mode.startswith("markers"):
             _draw_markers(canvas, panel, trace, places, label)

@@ -8,6 +8,12 @@ const plotConfig = {
   toImageButtonOptions: {format: "svg"},
 };
 
+// Plotly reads back what it has drawn; browsers warn where they have not been told before.
+const contextOf = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, options) {
+  return contextOf.call(this, kind, kind === "2d" ? {willReadFrequently: true, ...options} : options);
+};
+
 async function unpack(text) {
   const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));

@@ -18,7 +18,7 @@ from imu_fusion.report.orientation import angle_panels
 from imu_fusion.report.overview import number
 from imu_fusion.report.trajectory import map_figure, side_figure, space_figure
 from imu_fusion.samples import AttitudeLog, FixLog, PoseLog, VelocityLog, seconds
-from imu_fusion.streams.smoother import constant_states
+from imu_fusion.streams.smoother_messages import constant_states
 from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 

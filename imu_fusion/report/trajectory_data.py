@@ -14,7 +14,7 @@ from imu_fusion.messages.layouts import IMU, ODOMETRY
 from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.streams.registry import STAGES
-from imu_fusion.streams.smoother import (
+from imu_fusion.streams.smoother_messages import (
     ODOMETRY_TOPIC,
     RESULTS_TOPIC,
     SMOOTHED_IMU_TOPIC,

@@ -14,7 +14,7 @@ import numpy as np
 
 from imu_fusion.errors import shown
 from imu_fusion.samples.findings import Finding
-from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
+from imu_fusion.samples.logs import AccelerometerLog, FixLog, ImuLog, MagLog
 from imu_fusion.samples.turning import check_turning
 
 # Longer than this many usual intervals: at least one sample is missing.
@@ -327,11 +327,23 @@ def check_frames(frame_ids: Collection[str], name: str) -> list[Finding]:
                     unusable=True)]
 
 
+def check_accelerometer(log: AccelerometerLog | ImuLog, name: str,
+                        feels_gravity: bool = True) -> list[Finding]:
+    """All findings about an accelerometer alone, whose axes may point anywhere."""
+    return [*check_stamps(log.stamp, name),
+            *check_finite(log.acc, name, "acceleration"),
+            *(check_acceleration(log.acc, log.stamp, name) if feels_gravity else ()),
+            *check_held(log.acc, log.stamp, name),
+            *check_saturation(log.acc, name, "acceleration", "m/s^2")]
+
+
 def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
     """All findings about an ImuLog; that it lacks one of its two parts throughout is none."""
+    if not np.isfinite(log.gyr).any():
+        return check_accelerometer(log, name)
     parts = [(part, what) for part, what in ((log.gyr, "angular velocity"),
                                              (log.acc, "acceleration"))
-             if np.isfinite(part).any()] or [(log.acc, "acceleration")]
+             if np.isfinite(part).any()]
     return [*check_stamps(log.stamp, name),
             *(finding for part, what in parts for finding in check_finite(part, name, what)),
             *check_parts(log.gyr, log.acc, name),

@@ -216,7 +216,8 @@ class Guard:
         elif self.last is not None:
             self._interval = int(stamp[-1]) - self.last
         self.last = int(stamp[-1])
-        first = int(stamp.searchsorted(self.last - JUMP))
+        oldest = self.last - JUMP
+        first = 0 if stamp[0] >= oldest else int(stamp.searchsorted(oldest))
         if first or len(self._latest) > _PARTS:
             before = self._together() if not first else []
             self._latest = [part for part in before if len(part[0])]

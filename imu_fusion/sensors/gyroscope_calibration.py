@@ -36,12 +36,13 @@ class Turn:
     after: np.ndarray
 
 
-def calibrate_gyroscope(turns: Sequence[Turn], offset: np.ndarray, angle: float | None = None
-                        ) -> LinearCalibration:
+def calibrate_gyroscope(turns: Sequence[Turn], offset: np.ndarray, offset_sd: np.ndarray,
+                        angle: float | None = None) -> LinearCalibration:
     """Calibrate from turns about different axes.
 
     Args:
-        turns: each between two rests. offset: (3,) rad/s, mean rate at rest.
+        turns: each between two rests. offset, offset_sd: (3,) rad/s, mean rate at rest and its
+            standard deviation.
         angle: rad, by which every turn went, about one axis; None: not known. Gravity alone does
             not show the scale of an axis that was vertical in every turn about it.
 
@@ -75,7 +76,8 @@ def calibrate_gyroscope(turns: Sequence[Turn], offset: np.ndarray, angle: float 
     cov = np.zeros((12, 12))
     cov[:9, :9] = covariance(fit.jac, fit.fun, _BY_HAND)
     to_bias = -np.kron(np.eye(3), offset)        # b = -A offset
-    cov[9:, 9:] = to_bias @ cov[:9, :9] @ to_bias.T
+    cov[9:, 9:] = (to_bias @ cov[:9, :9] @ to_bias.T
+                   + matrix @ np.diag(np.square(offset_sd)) @ matrix.T)
     cov[9:, :9] = to_bias @ cov[:9, :9]
     cov[:9, 9:] = cov[9:, :9].T
     axes = np.array([_sum(t, offset) for t in turns])

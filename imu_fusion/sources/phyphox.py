@@ -116,9 +116,10 @@ class PhyphoxExport(WholeSource):
             if _kind(name, sheet) in ("accelerometer", "gyroscope"):
                 raise SampleError(f"{sheet.where}: no rows of numbers")
             self.remark(f"{sheet.where}: no rows of numbers")    # of a sensor that gave none
-        clock = _clock(sheets.pop("time", None))
+        clock = _clock(sheets.pop("time", None), self.lost)
         if clock is None:
-            self.remark("the export has no meta/time.csv: stamps begin at an arbitrary instant")
+            self.remark("the export tells no date (meta/time.csv): stamps begin at an arbitrary "
+                        "instant")
         sheets.pop("device", None)
         phone, blocks = Phone(), []
         for name, sheet in sheets.items():
@@ -168,11 +169,13 @@ class _Sheet:
             lost[f"readings of {self.where} that no later time follows"] += len(alone)
         return time[followed], values[followed]
 
-    def events(self, names: list[str]) -> list[tuple[str, float, float]]:
-        """(event, two numbers) of each row of the times of measuring that can be read."""
-        return [row for part in self._reader.sound(self.rows, lambda rows: list(zip(
+    def events(self, names: list[str], lost: Counter[str]) -> list[tuple[str, float, float]]:
+        """(event, two numbers) of each row of the times of measuring that can be read; others are
+        counted in ``lost``."""
+        parts = self._reader.sound(self.rows, lambda rows: list(zip(
             self._reader.texts(rows, names[0]), *(self._column(rows, n) for n in names[1:]))))
-            for row in part]
+        self._reader.account(lost, strict=False)
+        return [row for part in parts for row in part]
 
     def _sound(self, names: list[str], degrees: bool) -> np.ndarray:
         """(m, 1 + k) of rows that can be read: line, and numbers of columns of which the first is
@@ -294,7 +297,7 @@ def _kind(name: str, sheet: _Sheet) -> str:
     return ""
 
 
-def _clock(sheet: _Sheet | None) -> list[tuple[float, int]] | None:
+def _clock(sheet: _Sheet | None, lost: Counter[str]) -> list[tuple[float, int]] | None:
     """(experiment time s, Unix time of its zero in ns) from which each stretch of measuring
     counts: the phone's clock goes on while it pauses."""
     if sheet is None or "event" not in sheet.names:
@@ -304,7 +307,7 @@ def _clock(sheet: _Sheet | None) -> list[tuple[float, int]] | None:
     if not all(names):
         return None
     starts = [(float(t), round(u * 1000) * 1_000_000 - round(t * NANOSECONDS))
-              for event, t, u in sheet.events(names)
+              for event, t, u in sheet.events(names, lost)
               if event == "START" and abs(t) < _LONGEST and _UNIX[0] < u < _UNIX[1]]
     return starts or None
 

@@ -78,6 +78,7 @@ def _flow(value: Any) -> str:
     return repr(value)
 
 
+@np.errstate(over="ignore", invalid="ignore")    # wild values fit to nothing
 def sketch(data: bytes, where: str) -> Sketch:
     """A first description of a table from its beginning.
 

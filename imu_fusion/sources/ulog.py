@@ -92,6 +92,7 @@ class Ulog(WholeSource):
                 sets.setdefault(dataset.name, dataset.data)
         return self._blocks(sets, part)
 
+    @np.errstate(over="ignore", invalid="ignore")    # of damaged numbers, which the guards refuse
     def _blocks(self, sets: Sets, part: str) -> list[Block]:
         gps = sets.get("vehicle_gps_position") or sets.get("sensor_gps")
         missing: list[str] = []

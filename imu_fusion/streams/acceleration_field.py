@@ -1,5 +1,6 @@
 """The acceleration field estimator between its topics, live and in batch."""
 
+import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,21 +21,18 @@ from imu_fusion.estimation.acceleration_field.params import (
     AccelerometerParams,
     parse_configuration,
 )
-from imu_fusion.estimation.acceleration_field.rows import (
-    LEFT_OUT,
-    MISSING,
-    SATURATED,
-    field_at,
-)
+from imu_fusion.estimation.acceleration_field.rows import LEFT_OUT, MISSING, SATURATED
 from imu_fusion.estimation.acceleration_field.sensor_faults import FIT_UNITS
-from imu_fusion.geometry.rotation_arrays import rotation_matrices
+from imu_fusion.geometry.rotation import quat_to_matrix
+from imu_fusion.kernels import njit
 from imu_fusion.messages.convert import SampleType, imu_messages
 from imu_fusion.messages.layouts import ACCEL, IMU
-from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_message
+from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE, cloud_messages
 from imu_fusion.parameters.declare import Parameters, flatten, param
 from imu_fusion.parameters.file import ParamsFile, node_values, source_of
-from imu_fusion.samples import AccelerometerLog, ImuLog
+from imu_fusion.samples import AccelerometerLog, ImuLog, checks
 from imu_fusion.samples.blocks import Samples
+from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.matching import SampleMatcher
 from imu_fusion.streams.stage import Stage
 from imu_fusion.streams.stream import Conclusion, EstimatorNodeParams, Messages, Stream
@@ -93,7 +91,8 @@ def _gyr_values(values):
 
 ACCELEROMETER = SampleType(IMU, 3, _acc_values, AccelerometerLog)
 GYROSCOPE = SampleType(IMU, 3, _gyr_values,
-                       lambda stamp, gyr, frame: ImuLog(stamp, gyr, frame_id=frame))
+                       lambda stamp, gyr, frame: ImuLog(
+                           stamp, gyr, np.full_like(gyr, np.nan), frame))
 
 
 @dataclass(frozen=True)
@@ -143,6 +142,20 @@ class FieldConfiguration:
             inputs[GYROSCOPE_TOPIC] = GYROSCOPE
         return inputs
 
+    def findings(self, logs: Mapping[str, Any]) -> list[Finding]:
+        """What looks wrong with whole logs as recorded, by topic."""
+        found: list[Finding] = []
+        for topic, log in logs.items():
+            found += (checks.check_imu(log, topic) if topic == GYROSCOPE_TOPIC else
+                      checks.check_accelerometer(log, topic, self.feels_gravity))
+        return found
+
+    @property
+    def feels_gravity(self) -> bool:
+        """Whether the accelerometers, which all report the same, do."""
+        return self.field.gravity > 0.0 and all(
+            own.reports == "specific_force" for own in self.accelerometers.values())
+
     def make_estimator(self) -> AccelerationFieldEstimator:
         """The estimator of these parameters."""
         return AccelerationFieldEstimator(self.field, self.accelerometers)
@@ -158,29 +171,46 @@ def messages(config: FieldConfiguration, rows: np.ndarray) -> list[Messages]:
     """Messages of rows of the estimator."""
     if not len(rows):
         return []
-    gravity, frame = config.field.gravity, config.stream.body_frame
-    stamp = np.ascontiguousarray(rows["stamp"])
-    turn = rotation_matrices(rows["quat"])
-    back = turn.transpose(0, 2, 1)
-    cov = np.zeros((len(rows), 6, 6))
-    cov[:, :3, :3] = back @ rows["cov_acceleration_world"] @ turn
-    cov[:, 3:, 3:] = rows["cov_alpha"]
-    acceleration = (back @ rows["acceleration_world"][:, :, None])[:, :, 0]
+    frame, stamp = config.stream.body_frame, np.ascontiguousarray(rows["stamp"])
+    points = np.reshape(np.asarray(config.field.points, float), (-1, 3))
+    accel = np.zeros((len(rows), ACCEL.size))
+    cloud = np.empty((len(rows), len(points), len(_FIELDS)))
+    _fill(rows, points, config.field.gravity, accel, cloud)
     made = [
         Messages(IMU_TOPIC, stamp, imu_messages(
             stamp, frame, rows["omega"], rows["cov_omega"], rows["specific_force"],
             rows["cov_specific_force"], rows["quat"], rows["cov_attitude"],
             np.ones(len(rows), dtype=bool))),
-        Messages(ACCEL_TOPIC, stamp, ACCEL.encode_block(stamp, frame, np.hstack(
-            [acceleration, rows["alpha"], cov.reshape(-1, 36)])))]
-    points = np.reshape(config.field.points, (-1, 3))
+        Messages(ACCEL_TOPIC, stamp, ACCEL.encode_block(stamp, frame, accel))]
     if len(points):
-        bodies = field_at(rows, points, gravity)[1]
-        magnitude = np.linalg.norm(bodies, axis=2)
-        made.append(Messages(POINTS_TOPIC, stamp, [
-            cloud_message(int(s), frame, _FIELDS, np.column_stack([points, body, size]))
-            for s, body, size in zip(stamp, bodies, magnitude)]))
+        made.append(Messages(POINTS_TOPIC, stamp, cloud_messages(stamp, frame, _FIELDS, cloud)))
     return made
+
+
+@njit
+def _fill(rows, points, gravity, accel, cloud):
+    """Numbers of the messages of rows, in place: accel (n, 42) as in ACCEL, cloud (n, p, 7) as in
+    _FIELDS, of body points (p, 3); see :func:`~.rows.field_at`. gravity: m/s^2."""
+    for n in range(len(rows)):
+        row = rows[n]
+        turn = quat_to_matrix(row.quat)
+        back = np.ascontiguousarray(turn.T)
+        cov = back @ row.cov_acceleration_world @ turn
+        accel[n, :3] = back @ row.acceleration_world
+        accel[n, 3:6] = row.alpha
+        for i in range(3):
+            for j in range(3):
+                accel[n, 6 + 6 * i + j] = cov[i, j]
+                accel[n, 27 + 6 * i + j] = row.cov_alpha[i, j]
+        for p in range(len(points)):
+            change = row.gradient @ points[p]
+            square = 0.0
+            for i in range(3):
+                body = row.specific_force[i] + change[i] - gravity * turn[2, i]
+                cloud[n, p, i] = points[p, i]
+                cloud[n, p, 3 + i] = body
+                square += body * body
+            cloud[n, p, 6] = math.sqrt(square)
 
 
 class AccelerationFieldStream(Stream):
@@ -229,6 +259,12 @@ class AccelerationFieldStream(Stream):
                                              self.config.stream.impact)
             self._rows = []
         return made
+
+    def look_at(self, topic: str, logs: Mapping[str, Any]) -> list[str]:
+        if topic == GYROSCOPE_TOPIC or not self.config.feels_gravity:
+            return []
+        log = logs[topic]
+        return [found.text for found in checks.check_acceleration(log.acc, log.stamp, topic)]
 
     def conclude(self) -> Conclusion:
         """How the sensors fit, the greatest magnitudes, and the metrics of impacts if there are
@@ -297,9 +333,11 @@ class AccelerationFieldStream(Stream):
         if not len(rows):
             return []
         self.residual_rms = float(rows["residual_rms"][-1])
-        self.saturated += int(np.sum(rows["flags"] & SATURATED > 0))
-        self.missing += int(np.sum(rows["flags"] & MISSING > 0))
-        self.left_out += int(np.sum(rows["flags"] & LEFT_OUT > 0))
+        flags = rows["flags"]
+        if flags.any():
+            self.saturated += int(np.count_nonzero(flags & SATURATED))
+            self.missing += int(np.count_nonzero(flags & MISSING))
+            self.left_out += int(np.count_nonzero(flags & LEFT_OUT))
         if self.concludes:
             self._rows.append(rows)
         return messages(self.config, rows)
@@ -325,7 +363,8 @@ def _configure(stage, params_file):
     config = read_configuration(params_file)
     required = tuple(topic for topic in config.inputs if topic != GYROSCOPE_TOPIC)
     return replace(
-        stage, inputs=config.inputs, required=required, unusable="" if config.accelerometers else
+        stage, inputs=config.inputs, required=required, findings=config.findings,
+        unusable="" if config.accelerometers else
         "no accelerometers described; set accelerometers.names in a parameter file"), [config]
 
 

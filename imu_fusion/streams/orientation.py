@@ -1,45 +1,35 @@
 """The orientation estimator between its topics, live and in batch."""
 
-import math
 from collections.abc import Callable, Container, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from imu_fusion.errors import EstimationError, ParameterError
+from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.orientation.estimator import (
     UNITS,
     OrientationEstimator,
     OrientationParams,
 )
+from imu_fusion.estimation.orientation.lost_turn import LOST, unseen_turn
 from imu_fusion.estimation.orientation.mag_screen import MagScreen
-from imu_fusion.estimation.orientation.rows import FLAG_STILL, ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
-from imu_fusion.geometry.rotation import quat_exp, quat_rotate
-from imu_fusion.geometry.rotation_arrays import in_sensor_axes, turned_by
-from imu_fusion.messages.convert import (
-    GYROSCOPE_FIRST,
-    SAMPLE_TYPES,
-    bool_message,
-    orientation_messages,
-    rpy_messages,
-)
-from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, TWIST, VECTOR3
-from imu_fusion.messages.orientation_status import (
-    FLAGS_TYPE,
-    bias_message,
-    flags_message,
-    lasting_flags,
-)
-from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE, transform_messages
-from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.messages.convert import GYROSCOPE_FIRST, SAMPLE_TYPES
+from imu_fusion.messages.layouts import FIX, MAG
 from imu_fusion.samples import ImuLog, MagLog, checks
 from imu_fusion.samples.blocks import Samples, joined
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.turning import check_axes, check_turning
-from imu_fusion.sensors.linear_calibration import ImuCalibration
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
+from imu_fusion.streams.orientation_messages import (
+    OUTPUTS,
+    OrientationOutputParams,
+    OrientationWriter,
+    Pace,
+    outputs_of,
+)
 from imu_fusion.streams.stage import Stage, check_logs
 from imu_fusion.streams.stream import (
     FIX_TOPIC,
@@ -51,47 +41,14 @@ from imu_fusion.streams.stream import (
     Stream,
 )
 
-ORIENTATION_TOPIC = "imu/data"
-RPY_TOPIC = "imu/rpy/filtered"
-STEADY_TOPIC = "imu/steady_state"
-FLAGS_TOPIC = "imu/flags"
-BIAS_TOPIC = "imu/gyro_bias"
-SMOOTHED_TOPIC = "imu/data_smoothed"
-
 # At equal stamps in this order: an Imu sample uses the field of its own stamp.
 INPUTS = {FIX_TOPIC: SAMPLE_TYPES[FIX.msgtype], MAG_TOPIC: SAMPLE_TYPES[MAG.msgtype],
           IMU_TOPIC: GYROSCOPE_FIRST}
-OUTPUTS = {ORIENTATION_TOPIC: IMU.msgtype, RPY_TOPIC: VECTOR3.msgtype, STEADY_TOPIC: BOOL_TYPE,
-           FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype, SMOOTHED_TOPIC: IMU.msgtype}
-
-_UP = {"enu": 1.0, "nwu": 1.0, "ned": -1.0}  # z of the world frame's up
 _NO_FIX = np.empty(0, np.int64), np.empty((0, 13))
 _NO_MAG = np.empty(0, np.int64), np.empty((0, 3))
 _NO_IMU = np.empty(0, np.int64), np.empty((0, 6))
-_FEW = 4    # samples that are handed over faster one by one
-_BIAS_INTERVAL = 100_000_000  # ns; a bias does not change faster
+_FEW = 24    # samples that are handed over faster one by one
 _CALIBRATION_INTERVAL = 50_000_000  # ns; turning sensors show a new direction about as often
-
-
-@dataclass(frozen=True)
-class OrientationOutputParams(Parameters):
-    """What surrounds the estimator: samples before it, its orientation before it is published."""
-
-    remove_gravity_vector: bool = param(
-        False, doc="Publish imu/data with gravity taken out of the linear acceleration.")
-    gravity: float = param(9.80665, unit="m/s^2", low=9.7, high=9.9,
-                           doc="Gravity that remove_gravity_vector takes out.")
-    heading_deg: float = param(0.0, unit="deg", low=-360.0, high=360.0, read_only=False,
-                               doc="Yaw that the service set_heading makes the present one.")
-    publish_tf: bool = param(False, doc="Also write the orientation to /tf, from fixed_frame to "
-                             "the frame of the Imu. The node needs tf2_msgs.")
-    fixed_frame: str = param("odom", doc="Parent frame of that transform.")
-    calibration: ImuCalibration = ImuCalibration()
-
-
-def outputs_of(output: OrientationOutputParams) -> dict[str, str]:
-    """Topics and types of what is published under these parameters."""
-    return OUTPUTS | ({TF_TOPIC: TF_TYPE} if output.publish_tf else {})
 
 
 def _without_lost(acc, had_force):
@@ -105,109 +62,6 @@ def _without_lost(acc, had_force):
         return acc
     lost = ~present & (np.logical_or.accumulate(present) | had_force)
     return np.where(lost[:, None], np.nan, acc)
-
-
-class _Pace:
-    """Chooses samples at least an ``interval`` (ns) apart, however they come in blocks."""
-
-    def __init__(self, interval):
-        self._interval = interval
-        self.next = -1 << 63
-
-    def chosen(self, stamp):
-        """Indices of stamps (n,), ascending."""
-        found = []
-        k = int(stamp.searchsorted(self.next))
-        while k < len(stamp):
-            found.append(k)
-            self.next = int(stamp[k]) + self._interval
-            k = int(stamp.searchsorted(self.next))
-        return found
-
-
-class _Writer:
-    """Messages of the estimator's rows; turns them about the vertical by ``turn`` (rad).
-
-    ``turn`` is positive counter-clockwise seen from above, whatever the world frame.
-    """
-
-    def __init__(self, params, output):
-        self._up = _UP[params.world_frame]
-        self._output = output
-        self._flags = None
-        self._bias_pace = _Pace(_BIAS_INTERVAL)
-        self.turn = 0.0
-        self.yaw = None
-
-    def messages(self, rows, frame_id):
-        """Messages of rows, in order."""
-        if not len(rows):
-            return []
-        stamp = rows["stamp"]
-        rows, cdrs = self._orientations(rows, frame_id)
-        east = quat_rotate(rows["quat_world_imu"][-1], (1.0, 0.0, 0.0))
-        self.yaw = math.atan2(self._up * east[1], east[0])
-        made = [Messages(ORIENTATION_TOPIC, stamp, cdrs),
-                Messages(RPY_TOPIC, stamp, rpy_messages(rows, frame_id)),
-                *self._status(rows, frame_id), *self._biases(rows, frame_id)]
-        if self._output.publish_tf:
-            made.append(Messages(TF_TOPIC, stamp, transform_messages(
-                stamp, self._output.fixed_frame, frame_id, np.zeros((len(rows), 3)),
-                rows["quat_world_imu"])))
-        return made
-
-    def corrected(self, rows, frame_id):
-        """Messages of rows that looking ahead has corrected."""
-        if not len(rows):
-            return []
-        return [Messages(SMOOTHED_TOPIC, rows["stamp"], self._orientations(rows, frame_id)[1])]
-
-    def restart(self):
-        """What comes next is another stretch, perhaps at earlier stamps."""
-        self.turn = 0.0
-        self._bias_pace = _Pace(_BIAS_INTERVAL)
-
-    def set_yaw(self, yaw):
-        """Turn so that the last row's yaw (rad, counter-clockwise from above) is ``yaw``."""
-        self.turn += yaw - self.yaw
-
-    def _status(self, rows, frame_id):
-        """Messages of flags where they change."""
-        flags = lasting_flags(rows["flags"], self._flags or 0)
-        if (flags == self._flags).all():
-            return []
-        stamp = rows["stamp"]
-        before = np.append(~flags[0] if self._flags is None else self._flags, flags[:-1])
-        changed, turned = flags != before, (flags ^ before) & FLAG_STILL != 0
-        self._flags = int(flags[-1])
-        return [
-            Messages(STEADY_TOPIC, stamp[turned],
-                     [bool_message(bool(f & FLAG_STILL)) for f in flags[turned].tolist()]),
-            Messages(FLAGS_TOPIC, stamp[changed], [
-                flags_message(s, frame_id, f)
-                for s, f in zip(stamp[changed].tolist(), flags[changed].tolist())])]
-
-    def _biases(self, rows, frame_id):
-        """Messages of the bias, at most one per _BIAS_INTERVAL."""
-        chosen = self._bias_pace.chosen(rows["stamp"])
-        return [Messages(BIAS_TOPIC, rows["stamp"][chosen],
-                         [bias_message(rows[k], frame_id) for k in chosen])] if chosen else []
-
-    def _orientations(self, rows, frame_id):
-        """Rows as they are published, and their messages."""
-        has_force = rows["acc"].any(axis=1)   # zero: a gyroscope without an accelerometer
-        if self.turn or self._output.remove_gravity_vector:
-            rows = self._changed(rows, has_force)
-        return rows, orientation_messages(rows, frame_id, has_force)
-
-    def _changed(self, rows, has_force):
-        rows = rows.copy()
-        turn = quat_exp((0.0, 0.0, self._up * self.turn))
-        rows["quat_world_imu"] = turned_by(turn, rows["quat_world_imu"])
-        if self._output.remove_gravity_vector:
-            up = (0.0, 0.0, self._up * self._output.gravity)
-            rows["acc"][has_force] -= in_sensor_axes(rows["quat_world_imu"][has_force], up)
-        return rows
 
 
 def turn_to_true_north(params: OrientationParams, stamp: int, sample: np.ndarray) -> float | None:
@@ -262,11 +116,11 @@ class OrientationStream(Stream):
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
-        self._calibration_pace = _Pace(_CALIBRATION_INTERVAL)
+        self._calibration_pace = Pace(_CALIBRATION_INTERVAL)
         super().__init__(INPUTS, warn, output.calibration)
 
     def reset(self, session_topics: Container[str] | None = None) -> None:
-        self._writer = _Writer(self.params, self.output)
+        self._writer = OrientationWriter(self.params, self.output)
         super().reset(session_topics)
 
     def restart(self) -> None:
@@ -274,11 +128,14 @@ class OrientationStream(Stream):
         self._writer.restart()
         self._knows_north = False
         self._has_force = False
+        self._last_imu: int | None = None
+        self._said_lost = False
         self._kept: list[tuple[Samples, Samples]] = []
 
     def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
         imu = samples.get(IMU_TOPIC, _NO_IMU)
         mag = samples.get(MAG_TOPIC, _NO_MAG)
+        self._look_for_gaps(imu[0])
         # What is published from the first fix on refers to true north.
         stamp, turn = self._first_north(*samples.get(FIX_TOPIC, _NO_FIX))
         if self.params.mode == "smoothed":
@@ -292,6 +149,21 @@ class OrientationStream(Stream):
             imu, mag = ((s[k:], v[k:]) for (s, v), k in zip((imu, mag), before))
             self._writer.turn += turn
         return made + self._run(imu, mag)
+
+    def _look_for_gaps(self, stamps):
+        """Say once that the body may have turned by more than linear errors describe in a gap."""
+        if not len(stamps) or self._said_lost:
+            return
+        first = stamps[0] if self._last_imu is None else self._last_imu
+        longest = float(np.diff(stamps, prepend=first).max()) * 1e-9
+        self._last_imu = int(stamps[-1])
+        turn = unseen_turn(self.params, longest)
+        if turn > LOST and not self.params.fusion.use_acc:
+            self._said_lost = True
+            self.warn(f"{IMU_TOPIC}: nothing for {longest:.2f} s, in which the body may have "
+                      f"turned by {turn:.1f} rad (gap.rate_sd): from there on only the direction "
+                      "of the field is known of its orientation, and nothing of the turn about "
+                      "it. The smoother knows more, where there are fixes or a surface")
 
     def flush(self) -> list[Messages]:
         made: list[Messages] = []
@@ -315,8 +187,6 @@ class OrientationStream(Stream):
         Raises:
             EstimationError: there is no orientation yet.
         """
-        if self._writer.yaw is None:
-            raise EstimationError("no orientation yet: nothing to set the heading of")
         self._writer.set_yaw(yaw)
         self._knows_north = True
 

@@ -5,6 +5,7 @@ import pytest
 
 from imu_fusion.errors import MessageError
 from imu_fusion.estimation.orientation import rows as st
+from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.messages.orientation_status import (
     WORDS,
@@ -14,7 +15,7 @@ from imu_fusion.messages.orientation_status import (
     flags_value,
     lasting_flags,
 )
-from imu_fusion.streams import orientation as orientation_stream
+from imu_fusion.streams.orientation_messages import OrientationOutputParams, OrientationWriter
 from imu_fusion.streams.stream import one_by_one
 
 
@@ -54,8 +55,7 @@ def test_flags_come_when_they_change_and_biases_ten_times_a_second():
     rows["quat_world_imu"][:, 3] = 1.0
     rows["flags"][100:200] = st.FLAG_SATURATED
     rows["flags"][150:300] |= st.FLAG_STILL
-    writer = orientation_stream._Writer(orientation_stream.OrientationParams(),
-                                        orientation_stream.OrientationOutputParams())
+    writer = OrientationWriter(OrientationParams(), OrientationOutputParams())
     messages = list(one_by_one(writer.messages(rows[:170], "imu")
                                + writer.messages(rows[170:], "imu")))
     flags = [flags_value(cdr) for topic, _, cdr in messages if topic == "imu/flags"]

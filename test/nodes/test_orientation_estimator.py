@@ -27,7 +27,7 @@ from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
-from imu_fusion.streams.orientation import OUTPUTS as TYPES
+from imu_fusion.streams.orientation_messages import OUTPUTS as TYPES
 from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, collector
 

@@ -24,7 +24,7 @@ from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.streams.smoother import RESULTS_TOPIC, results_value
+from imu_fusion.streams.smoother_messages import RESULTS_TOPIC, results_value
 from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, write_bag
 from test.nodes.test_smoother import write

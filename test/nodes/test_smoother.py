@@ -22,8 +22,8 @@ from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.nodes.smoother import SmootherNode
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
-from imu_fusion.streams import smoother as smoothing
-from imu_fusion.streams.smoother import OUTPUTS, RESULTS_TOPIC, SmootherStream, results_value
+from imu_fusion.streams.smoother import SmootherStream, smooth
+from imu_fusion.streams.smoother_messages import OUTPUTS, RESULTS_TOPIC, Outcome, results_value
 from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, collector
 
@@ -108,8 +108,8 @@ class Here:
 
     def __init__(self, params, logs):
         if not self.answers:
-            result = smoothing.smooth(params, logs)
-            self.answers.append((result.samples, smoothing.Outcome.of(result, "car")))
+            result = smooth(params, logs)
+            self.answers.append((result.samples, Outcome.of(result, "car")))
 
     def is_done(self):
         return True

@@ -3,9 +3,9 @@
 import pytest
 
 from imu_fusion.errors import ParameterError
+from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.parameters.bounded_yaml import MAX_BYTES, parse_yaml, read_yaml
 from imu_fusion.parameters.file import load
-from imu_fusion.streams.orientation import OrientationParams
 
 BOMB = "a0: &a0 [x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))

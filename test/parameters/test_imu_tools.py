@@ -8,9 +8,10 @@ from click.testing import CliRunner
 
 from imu_fusion import cli
 from imu_fusion.errors import ParameterError
+from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.parameters.file import parameters_for
 from imu_fusion.parameters.imu_tools import translate
-from imu_fusion.streams.orientation import OrientationOutputParams, OrientationParams
+from imu_fusion.streams.orientation_messages import OrientationOutputParams
 
 #: The keys of imu_filter_madgwick's own example, with values that mean something.
 MADGWICK = """

@@ -48,4 +48,5 @@ def test_one_accelerometer_of_an_array_is_no_imu(tmp_path):
                 START + i * STEP, "head", None, [0.0, 0.0, 9.81]), START + i * STEP)
     result = CliRunner().invoke(cli, ["process", str(tmp_path / "bag"), str(tmp_path / "out")])
     assert result.exit_code == 1 and "imu/data_raw" in result.output
-    assert "--remap" not in result.output
+    assert "--remap" not in result.output and "/accelerometers/front" not in result.output
+    assert "it has accelerometers of an array" in result.output

@@ -15,7 +15,7 @@ from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.avalanche import slope_of, slope_section
 from imu_fusion.report.html import Figure, Table, render_report
 from imu_fusion.report.smoother import Smoothed
-from imu_fusion.streams.smoother import SmootherNodeParams, SmoothingParams
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 from imu_fusion.surfaces.file import load_surface
 from test.report.test_report import Page
 
@@ -66,17 +66,22 @@ def test_phases_velocities_and_flights_are_those_of_the_truth(smoothed, logs):
 
 def test_the_section_has_its_tables_and_figures(smoothed, logs):
     section = slope_section(slope_of(smoothed, logs["imu/data_raw"]), logs["imu/mag"])
-    phases, flights = (b for b in section.blocks if isinstance(b, Table))
+    phases, flights, in_situ = (b for b in section.blocks if isinstance(b, Table))
     assert [row[0][0] for row in phases.rows] == list("123456")
     assert all(len(row[-1]) > 10 for row in phases.rows)      # each with its reason
     lengths = [float(row[2]) for row in flights.rows]
     assert len(lengths) > 3 and max(lengths) == lengths[0] > 10
     figures = [b for b in section.blocks if isinstance(b, Figure)]
-    assert len(figures) == 6
+    assert len(figures) == 7
     text = Page(render_report("t", [section])).text
     assert "blind to a turn about the field" in text
     names = {trace.name for figure in figures for trace in figure.figure.data}
-    assert {"terrain", "sensors alone, before calibration", "field model", "±3σ across"} <= names
+    assert {"terrain", "sensors alone, before calibration", "field model", "objective",
+            "±3σ across"} <= names
+    # True attitudes, an accelerometer that errs by 3 %: the terrain brings the track back to it.
+    (off,) = (row[1] for row in in_situ.rows if row[0].startswith("off the slope"))
+    before, after = (float(part.split()[0]) for part in off.split(","))
+    assert before > 1.0 and after < 0.5
     # Within sixteen degrees of dip the uncalibrated field of the recording shows its iron.
     (dip,) = {float(trace.y[0]) for figure in figures for trace in figure.figure.data
               if trace.name == "field model" and 60 < trace.y[0] < 66}

@@ -5,11 +5,12 @@ import re
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from matplotlib import rc_context
 
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.report.figures import Band, Line, Panel, Shade, style, time_figure
 from imu_fusion.report.html import Figure, Section, Text
-from imu_fusion.report.paper import COLUMN_WIDTH, draw, write_figures
+from imu_fusion.report.paper import COLUMN_WIDTH, SETTINGS, draw, write_figures
 
 T = np.linspace(0.0, 9.0, 400)
 
@@ -52,6 +53,27 @@ def test_panels_have_the_lines_bands_spans_and_labels_of_the_report():
         "±1σ", "price in $", "fixes", "other", "in the air"}
     bands = [p for p in upper.patches if p.get_label() == "±1σ" or len(p.get_xy()) > 5]
     assert len(bands) == 2    # on both sides of the gap
+
+
+@pytest.mark.parametrize("names, columns", [
+    (["a", "b", "c", "d"], 3),
+    (["σ of the specific force", "σ of the acceleration", "c"], 2),
+    (["σ of the kinematic acceleration in the axes of the body", "a" * 90], 1)])
+def test_a_legend_is_read_in_rows_and_no_wider_than_the_column(names, columns):
+    with rc_context(SETTINGS):
+        canvas = draw(time_figure([Panel("a", tuple(
+            Line(name, T, T, "#0072B2") for name in names))]))
+        canvas.draw_without_rendering()
+    (legend,) = canvas.legends
+    assert legend._ncols == columns
+    box = legend.get_window_extent()
+    assert box.x0 >= 0.0 and box.x1 <= canvas.bbox.width
+    rows: dict[int, list] = {}
+    for text in legend.get_texts():
+        rows.setdefault(round(-text.get_window_extent().y0 / 5), []).append(text)
+    read = [text.get_text().replace("\n", "") for _, row in sorted(rows.items())
+            for text in sorted(row, key=lambda text: text.get_window_extent().x0)]
+    assert [text.replace(" ", "") for text in read] == [name.replace(" ", "") for name in names]
 
 
 def test_a_map_keeps_one_scale_and_space_its_colours():

@@ -46,10 +46,18 @@ def test_a_broken_line_costs_itself(tmp_path, kind, damage):
                      "two in one": line.rstrip(b"\r\n") + b","}[damage]
     file.write_bytes(b"".join(lines))
     after, lost = counts(file)
-    (said,) = (text for text in lost if "cannot be read" in text)
+    (said,) = lost
     assert "1 lines that cannot be read, the first: " in said and f"{file}, line " in said
     # A line that ran on takes another one along; where a force is missing one is interpolated.
     assert all(count - 2 <= after[topic] <= count for topic, count in before.items())
+
+
+def test_a_broken_time_of_an_experiment_is_told(tmp_path):
+    file = write_device("phyphox_time", tmp_path)
+    before, _ = counts(file)
+    file.write_bytes(file.read_bytes().replace(b'"PAUSE",.5E0', b'"PAUSE",.5X0'))
+    after, (said,) = counts(file)
+    assert after == before and f"{file}, line 3" in said
 
 
 def test_a_track_is_read_up_to_its_damage():

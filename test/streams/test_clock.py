@@ -10,12 +10,9 @@ from imu_fusion.messages.layouts import IMU
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from imu_fusion.streams.acceleration_field import AccelerationFieldStream, FieldConfiguration
-from imu_fusion.streams.orientation import (
-    IMU_TOPIC,
-    MAG_TOPIC,
-    ORIENTATION_TOPIC,
-    OrientationStream,
-)
+from imu_fusion.streams.orientation import OrientationStream
+from imu_fusion.streams.orientation_messages import ORIENTATION_TOPIC
+from imu_fusion.streams.stream import IMU_TOPIC, MAG_TOPIC
 
 EPOCH = 1_700_000_000_000_000_000
 SENSORS = Sensors(gyr_density=1e-4, acc_density=2e-3, mag_sd=3e-7)

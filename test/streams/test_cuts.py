@@ -9,15 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
 from imu_fusion.messages.layouts import IMU
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from imu_fusion.streams.acceleration_field import AccelerationFieldStream, FieldConfiguration
-from imu_fusion.streams.orientation import (
-    OrientationOutputParams,
-    OrientationParams,
-    OrientationStream,
-)
+from imu_fusion.streams.orientation import OrientationStream
+from imu_fusion.streams.orientation_messages import OrientationOutputParams
 from imu_fusion.streams.smoother import SmootherStream
 
 EPOCH = 1_700_000_000_000_000_000

@@ -9,13 +9,9 @@ from imu_fusion.messages.convert import imu_message, mag_message
 from imu_fusion.messages.layouts import IMU, NANOSECONDS
 from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE
 from imu_fusion.messages.typestore import TYPES
-from imu_fusion.streams.orientation import (
-    IMU_TOPIC,
-    MAG_TOPIC,
-    ORIENTATION_TOPIC,
-    OrientationOutputParams,
-    OrientationStream,
-)
+from imu_fusion.streams.orientation import OrientationStream
+from imu_fusion.streams.orientation_messages import ORIENTATION_TOPIC, OrientationOutputParams
+from imu_fusion.streams.stream import IMU_TOPIC, MAG_TOPIC
 
 
 @pytest.mark.parametrize("values", [{}, {"method": "gyro_mag"},

@@ -15,13 +15,8 @@ from imu_fusion.messages.layouts import ODOMETRY
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
-from imu_fusion.streams.smoother import (
-    ODOMETRY_TOPIC,
-    RESULTS_TOPIC,
-    Frames,
-    SmoothingParams,
-    results_value,
-)
+from imu_fusion.streams.smoother_messages import ODOMETRY_TOPIC, RESULTS_TOPIC, results_value
+from imu_fusion.streams.smoother_params import Frames, SmoothingParams
 
 ROOT = Path(__file__).parent.parent.parent
 

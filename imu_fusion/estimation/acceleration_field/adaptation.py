@@ -23,7 +23,7 @@ from imu_fusion.kernels import njit
 ADAPTATION = np.dtype([
     ("noise", "f8"), ("motion", "f8"), ("product", "f8"), ("square", "f8"),
     ("grace", "i8"), ("samples", "i8", 2), ("most", "f8", 2), ("vague", "i8"),
-    ("tracked", "f8", (6, 5))],
+    ("tracked", "f8", (6, 6))],
     align=True)
 
 _EXPECTED = 1.5     # mean square of a channel's innovation that is no excess, in its variances
@@ -41,12 +41,13 @@ def factor(excess):
 
 
 @njit
-def summed(total, squares, largest):
-    """The summed excess with the mean ``squares`` of one more sample. What was large goes the
-    faster; what comes makes a variance no more than ``largest`` times larger, as was seen."""
+def summed(total, squares, largest, least):
+    """The summed excess, at ``least`` that, with the mean ``squares`` of one more sample. What was
+    large goes the faster; what comes makes a variance no more than ``largest`` times larger, as was
+    seen."""
     excess = squares - _EXPECTED
     if excess < 0.0:
-        return max(total + excess * max(1.0, total / _SLOWNESS), 0.0)
+        return max(total + excess * max(1.0, total / _SLOWNESS), least)
     return max(total, min(total + excess, _CHANCE + _SLOWNESS * math.log(max(largest, 1.0))))
 
 
@@ -66,17 +67,9 @@ def note(adaptation, kind, excess):
 
 
 @njit
-def adapt(adaptation, squares, contradiction, watched, innovation, last):
-    """Take one sample.
-
-    Args:
-        adaptation: ADAPTATION, changed.
-        watched: whether it was enough for the motion to be watched; else its innovations tell.
-        squares: mean of the squares of its innovations, in units of their variances.
-        contradiction: mean square of what no rigid motion explains, in units of the noise of the
-            parameters.
-        innovation: (m,) before any of them was used; last: (m,) that of the sample before; changed.
-    """
+def follow(adaptation, innovation, last):
+    """Keep whether innovations change their signs: of this sample (m,), before any was used, and of
+    the one before, ``last`` (m,), which becomes this."""
     product, square = 0.0, 0.0
     for c in range(len(innovation)):
         product += innovation[c] * last[c]
@@ -84,15 +77,29 @@ def adapt(adaptation, squares, contradiction, watched, innovation, last):
         last[c] = innovation[c]
     adaptation.product = _MEMORY * adaptation.product + product
     adaptation.square = _MEMORY * adaptation.square + square
+
+
+@njit
+def adapt(adaptation, squares, contradiction, watched):
+    """Take one sample, which was followed.
+
+    Args:
+        adaptation: ADAPTATION, changed.
+        squares: mean of the squares of its innovations, in units of their variances.
+        contradiction: mean square of what no rigid motion explains, in units of the noise of the
+            parameters.
+        watched: whether it was enough for the motion to be watched; else its innovations tell.
+    """
     if adaptation.grace > 0:
         adaptation.grace -= 1
         return
     noise = squares
     if not alternates(adaptation, 1.0):
         noise = min(squares, contradiction / factor(adaptation.noise))
-    adaptation.noise = summed(adaptation.noise, noise, noise * factor(adaptation.noise))
+    adaptation.noise = summed(adaptation.noise, noise, noise * factor(adaptation.noise), 0.0)
     if not watched:
         motion = squares / max(noise, 1.0)
-        adaptation.motion = summed(adaptation.motion, motion, motion * factor(adaptation.motion))
+        adaptation.motion = summed(adaptation.motion, motion, motion * factor(adaptation.motion),
+                                   0.0)
         note(adaptation, 1, adaptation.motion)
     note(adaptation, 0, adaptation.noise)

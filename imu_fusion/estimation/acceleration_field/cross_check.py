@@ -70,6 +70,7 @@ class Workspace(NamedTuple):
     trial: Fit             # without one of them
     innovation: np.ndarray   # (m,) reading minus what is expected of it; 0 where there is none
     variance: np.ndarray   # (m,) of it, but for a and alpha
+    spun: np.ndarray       # (m,) of it, what errors of the angular velocity make
     left: np.ndarray       # (m,) what the fit leaves over
     use: np.ndarray        # (m,) bool, the answer
     doubt: np.ndarray      # (m,) variance to add to that of the noise
@@ -93,7 +94,8 @@ def make_workspace(channels: np.ndarray) -> Workspace:
     return Workspace(
         np.zeros((m, TOUCHED), np.int64), np.zeros((m, TOUCHED)), np.zeros(m, np.int64),
         np.zeros(m), np.zeros((3, 3)), design, fit(), fit(), np.zeros(m), np.ones(m), np.zeros(m),
-        np.zeros(m, bool), np.zeros(m), np.zeros(1, bool), np.zeros(1, bool), np.zeros((3, 3)))
+        np.zeros(m), np.zeros(m, bool), np.zeros(m), np.zeros(1, bool), np.zeros(1, bool),
+        np.zeros((3, 3)))
 
 
 @njit
@@ -283,14 +285,15 @@ def _allow(state, p, channels, reading, at, work):
         channel = channels[c]
         if channel.is_gyro or not math.isfinite(reading[c]):
             work.variance[c] = 1.0
+            work.spun[c] = 0.0
             continue
         h, r = work.row[c], channel.lever
-        turned = spin * spin * (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        spun = spin * spin * (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
         for i in range(3):
             for j in range(3):
-                turned += h[i] * cov[i, j] * h[j]
-        work.variance[c] = (noise_variance(channel, p) + channel.bias_sd * channel.bias_sd
-                            + turned)
+                spun += h[i] * cov[i, j] * h[j]
+        work.spun[c] = spun
+        work.variance[c] = noise_variance(channel, p) + channel.bias_sd * channel.bias_sd + spun
         squares += reading[c] * reading[c]
         count += 1
     omega = at[OMEGA:ALPHA]

@@ -32,6 +32,7 @@ from imu_fusion.estimation.acceleration_field.rows import ROW, put_still_rows
 from imu_fusion.estimation.acceleration_field.sensor_array import make_sensor_array
 from imu_fusion.estimation.acceleration_field.sensor_faults import (
     SensorFit,
+    coarse_remarks,
     fit_remarks,
     sensor_fits,
 )
@@ -103,7 +104,8 @@ class AccelerationFieldEstimator:
                          "it states leaves their errors out; use rigid_body, or say that they are "
                          "(position_sd and axes_sd 0)")
         if self._judged is not None:
-            found += fit_remarks(self.sensor_fits(), self._judged)
+            found += fit_remarks(self.sensor_fits(), self.array, self._judged)
+        found += coarse_remarks(self.names, self.array, self.params, self._limits.steps)
         unit = {"gyroscope": "rad/s"}
         for name, limits in self.limits_found.items():
             known = ", ".join(f"{limit:.6g}" for limit in limits if np.isfinite(limit))
@@ -130,7 +132,8 @@ class AccelerationFieldEstimator:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else self._filter.get_state(),
                 "start": self._start, "rest": self._rest, "last": self._last, "waits": self._waits,
-                "limits": self._limits.found.copy(), "late": list(self._late),
+                "limits": (self._limits.found.copy(), self._limits.steps.copy()),
+                "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -138,7 +141,8 @@ class AccelerationFieldEstimator:
         self._start, self._rest, self._last = state["start"], state["rest"], state["last"]
         self._waits = state["waits"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
-        self._limits.found, self._late = state["limits"].copy(), list(state["late"])
+        self._limits.found, self._limits.steps = (part.copy() for part in state["limits"])
+        self._late = list(state["late"])
         self._filter = None
         if state["filter"] is not None:
             self._filter = self._make_filter(self._start)

@@ -25,8 +25,10 @@ from imu_fusion.estimation.acceleration_field.motion_model import (
 )
 from imu_fusion.kernels import njit
 
-# Columns of ADAPTATION's ``tracked``: a component, its rate, variances of both, their covariance.
-_VALUE, _RATE, _VV, _RR, _VR = range(5)
+# Columns of ADAPTATION's ``tracked``: a component, its rate, variances of both, their covariance,
+# and its own summed excess, beyond _ALONE.
+_VALUE, _RATE, _VV, _RR, _VR, _EXCESS = range(6)
+_ALONE = 30.0   # how much more one component must exceed: chance makes it large more often than six
 
 
 @njit
@@ -46,7 +48,7 @@ def watch_motion(state, p, channels, reading, at, step, work):
         state.fitted[:] = False
         return
     values, variances = np.zeros(6), np.zeros(6)
-    _fit_readings(state, p, channels, reading, at, fit, values, variances)
+    _fit_readings(state, p, channels, reading, at, work, values, variances)
     tracked = adaptation.tracked
     goes_on = step.dt[0] > 0.0
     for c in range(len(channels)):
@@ -84,14 +86,19 @@ def _judge(state, p, step, values, variances):
     adaptation = state.adaptation[0]
     tracked = adaptation.tracked
     before = factor(adaptation.motion)
-    squares, largest = 0.0, 1.0
+    squares, largest = np.empty(6), np.empty(6)
     for i in range(6):
         square, total = (values[i] - tracked[i, _VALUE]) ** 2, tracked[i, _VV] + variances[i]
-        squares += square / total / 6.0
-        largest = max(largest, before + (square - total) / _noise(i, p, step)[0])
+        squares[i] = square / total
+        largest[i] = max(before + (square - total) / _noise(i, p, step)[0], 1.0)
     # Chance must not hide the onset of an impact.
     if not alternates(adaptation, 2.0):
-        adaptation.motion = summed(adaptation.motion, squares, largest)
+        adaptation.motion = summed(adaptation.motion, squares.mean(), largest.max(), 0.0)
+        # Once all are wider, five that fit would hide one that does not: blows have a direction.
+        for i in range(6):
+            alone = summed(tracked[i, _EXCESS] - _ALONE, squares[i], largest[i], -_ALONE)
+            tracked[i, _EXCESS] = alone + _ALONE
+            adaptation.motion = max(adaptation.motion, alone)
         note(adaptation, 1, adaptation.motion)
     wilder = max(factor(adaptation.motion) - before, 0.0)
     if wilder > 0.0:
@@ -101,10 +108,10 @@ def _judge(state, p, step, values, variances):
 
 
 @njit
-def _fit_readings(state, p, channels, reading, at, fit, values, variances):
+def _fit_readings(state, p, channels, reading, at, work, values, variances):
     """The fit (6,) of a and alpha (times the radius) to the readings as they are, but for the
-    centripetal part, and the variances (6,) of its noise."""
-    w = at[OMEGA:OMEGA + 3]
+    centripetal part, and the variances (6,) of its noise and of that part."""
+    w, fit = at[OMEGA:OMEGA + 3], work.fit
     noisiness = factor(state.adaptation[0].noise)
     for c in range(len(channels)):
         if not fit.used[c]:
@@ -115,7 +122,7 @@ def _fit_readings(state, p, channels, reading, at, fit, values, variances):
         ur = u[0] * r[0] + u[1] * r[1] + u[2] * r[2]
         ww = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
         value = reading[c] - uw * rw + ur * ww
-        noise = noisiness * noise_variance(channels[c], p)
+        noise = noisiness * noise_variance(channels[c], p) + work.spun[c]
         for i in range(6):
             values[i] += fit.solve[i, c] * value
             variances[i] += fit.solve[i, c] * fit.solve[i, c] * noise

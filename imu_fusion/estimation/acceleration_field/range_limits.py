@@ -18,7 +18,8 @@ _ACC_FLOOR, _GYRO_FLOOR = 19.0, 1.0     # m/s^2, rad/s
 class RangeLimits:
     """What is known of the ranges of an array's sensors, by their samples so far.
 
-    ``found`` (K,) FLAT_TOPS, the gyroscope last.
+    ``found`` (K,) FLAT_TOPS and ``steps`` (K, 3), the smallest by which an axis has changed; the
+    gyroscope last.
     """
 
     def __init__(self, array: SensorArray) -> None:
@@ -28,6 +29,7 @@ class RangeLimits:
         self._ranges.reshape(-1)[channels["column"]] = channels["range"]
         self._accelerometers = array.accelerometers
         self.found = np.zeros(number, FLAT_TOPS)
+        self.steps = np.full((number, 3), np.inf)
         _start(self.found, self._ranges)
 
     def mark(self, readings: np.ndarray) -> np.ndarray:
@@ -37,7 +39,8 @@ class RangeLimits:
         in a row is left out even before: no noise is so quiet, and the others fill in.
         """
         marked = readings.copy()
-        _mark(self.found, self._ranges, self._accelerometers, marked.reshape(len(readings), -1, 3))
+        _mark(self.found, self.steps, self._ranges, self._accelerometers,
+              marked.reshape(len(readings), -1, 3))
         return marked
 
     @property
@@ -53,22 +56,25 @@ def _start(found, ranges):
 
 
 @njit
-def _mark(found, ranges, accelerometers, readings):
+def _mark(found, steps, ranges, accelerometers, readings):
     """Set what is at a limit to inf, in place: readings (n, K, 3), gyroscopes last."""
     sample, last = np.empty(3), np.empty(3)
     for n in range(len(readings)):
         for k in range(len(found)):
             felt = k < accelerometers
             floor = _ACC_FLOOR if felt else _GYRO_FLOOR
+            if not np.isfinite(readings[n, k]).any():
+                continue    # lost: what comes next would seem to have jumped
             for i in range(3):
                 value = readings[n, k, i]
-                # An axis that is not measured, or has no value, is at no limit.
-                sample[i] = value if np.isfinite(value) else 0.0
                 last[i] = found[k].last[i]
+                sample[i] = value if np.isfinite(value) else last[i]
+                if found[k].seen and sample[i] != last[i]:
+                    steps[k, i] = min(steps[k, i], abs(sample[i] - last[i]))
             clipped = find_flat_tops(found[k], ranges[k], floor, felt, sample)
             for i in range(3):
                 size = abs(sample[i])
                 stands = (sample[i] == last[i] and size > floor and np.isnan(ranges[k, i])
                           and size >= found[k].largest[i])
-                if clipped >> i & 1 or stands:
+                if np.isfinite(readings[n, k, i]) and (clipped >> i & 1 or stands):
                     readings[n, k, i] = np.inf

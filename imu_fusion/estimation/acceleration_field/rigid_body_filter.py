@@ -8,6 +8,7 @@ from imu_fusion.estimation.acceleration_field.adaptation import (
     ADAPTATION,
     GRACE,
     adapt,
+    follow,
 )
 from imu_fusion.estimation.acceleration_field.cross_check import (
     CHECK,
@@ -102,6 +103,7 @@ def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, wor
     linearise(channels, at, work)
     cross_check(state, p, channels, reading, at, work)
     if p.is_adaptive:
+        follow(state.adaptation[0], work.innovation, state.innovation)
         watch_motion(state, p, channels, reading, at, step, work)
     if is_predicted:
         linearise_well(state, p, channels, at, work)
@@ -115,7 +117,7 @@ def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, wor
         state.adaptation[0].vague += 1
     if found.used > 0 and p.is_adaptive:
         adapt(state.adaptation[0], found.squares / found.used, contradiction(p, channels, work),
-              work.fit.redundancy[0] >= 0, work.innovation, state.innovation)
+              work.fit.redundancy[0] >= 0)
     return found
 
 

@@ -7,14 +7,17 @@ import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.acceleration_field.motion_model import State
+from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 
 _SAMPLES = 10       # left out: fewer are single wild readings, without a cause to name
 _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave over
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
+_UNLIKELY = 0.01    # chance of mountings that, taken together, are further off: worth a remark
 _WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
-_VAGUE = 0.1        # of the samples, in which the angular velocity may be hardly known
+_NOISIER = 1.25     # as much for the noise, if it lasts: data that fit never change it
+_SHARE = 0.1        # of the samples, in which noise may be larger, or the rate hardly known
 _MOSTLY = 0.5       # of the samples: an impact is wilder than what is before and after it
 
 
@@ -73,43 +76,83 @@ def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[Sens
     return found
 
 
-def fit_remarks(fits: list[SensorFit], state: State) -> list[str]:
+def coarse_remarks(names: list[str], array: SensorArray, params: AccelerationFieldParams,
+                   steps: np.ndarray) -> list[str]:
+    """Accelerometers whose readings change by nothing finer than ``steps`` (K, 3), so that rounding
+    alone is more than the noise that is stated. A step errs by its size / sqrt(12)."""
+    remarks = []
+    for k, name in enumerate(names):
+        density = float(array.channels["density"][array.channels["sensor"] == k][0])
+        stated = params.noise_scale * density * np.sqrt(params.sample_rate)
+        known = steps[k][np.isfinite(steps[k])]
+        if len(known) and known.max() > np.sqrt(12.0) * stated:
+            step = float(known.max())
+            needed = step / np.sqrt(12.0 * params.sample_rate)
+            remarks.append(
+                f"accelerometer '{name}' reads in steps of {step:.3g} m/s^2, whose rounding is "
+                f"more than its noise of {stated:.2g}: set accelerometers.{name}.noise_density to "
+                f"{needed:.2g} or more, and bias_sd to {step / np.sqrt(12.0):.2g} or more")
+    return remarks
+
+
+def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list[str]:
     """What is wrong with the sensors, single ones and as a whole, and what to do."""
+    or_gyro = (", or unit, axes and sign of the gyroscope" if array.channels["is_gyro"].any()
+               else "")
     remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
+    remarks = remarks or _together(fits, array)
     moved = [fit.name for fit in fits if fit.mounting]
     if len(moved) > len(fits) / 2:
         # Of so many, what they have in common is more likely.
         remarks = [fit.fault for fit in fits if fit.fault] + [
             f"positions or axes of {len(moved)} of {len(fits)} accelerometers do not fit what is "
-            "described: check units and scale of the positions; or the motion is faster than the "
-            "sampling"]
-    doubted = int(state.checks["doubted"].max())
+            f"described: check units and scale of the positions{or_gyro}; or the motion is faster "
+            "than the sampling"]
+    doubted, checked = (int(state.checks[name].max()) for name in ("doubted", "checked"))
     if doubted >= _SAMPLES:
         remarks.append(
-            f"the accelerometers contradict each other in {doubted} of "
-            f"{state.checks['checked'].max()} samples, and no single one is to blame; these count "
-            "for little: are two of them exchanged, or several positions, axes, units or ranges "
-            "wrong?")
+            f"the accelerometers contradict each other in {doubted} of {checked} samples, and no "
+            "single one is to blame; these count for little: are two of them exchanged, or several "
+            f"positions, axes, units or ranges wrong{or_gyro}?")
     adaptation = state.adaptation[0]
     noise, motion = (float(most) for most in adaptation["most"])
-    if noise > _WIDER:
+    lasts = adaptation["samples"][0] > max(_SAMPLES, _SHARE * checked)
+    if noise > (_NOISIER if lasts else _WIDER):
         remarks.append(
             f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
             f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
-            "jitter of the stamps, flexing, ringing or clipping, or raise noise_scale")
-    checked = state.checks["checked"].max()
-    if adaptation["vague"] > max(_SAMPLES, _VAGUE * checked):
+            "jitter of the stamps, flexing, ringing, clipping or a scale that is off by a percent, "
+            "or raise noise_scale")
+    if adaptation["vague"] > max(_SAMPLES, _SHARE * checked):
         remarks.append(
             f"the angular velocity is hardly known in {adaptation['vague']} of {checked} samples: "
             "accelerometers tell its products alone, and by motion.jerk_density it may change by "
             "as much from sample to sample; lower that if it does not, sample faster, or add a "
             "gyroscope (use_gyro: true)")
-    if motion > _WIDER and adaptation["samples"][1] > _MOSTLY * state.checks["checked"].max():
+    if motion > _WIDER and adaptation["samples"][1] > _MOSTLY * checked:
         remarks.append(
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
             "motion.jerk_density and motion.acceleration_rate_density, or use maximum_likelihood")
     return remarks
+
+
+def _together(fits, array):
+    """A text on mountings none of which is far off, while all of them together are."""
+    squares, number = 0.0, 0
+    for k, fit in enumerate(fits):
+        own = array.channels[array.channels["sensor"] == k][0]
+        for error, sd in ((fit.position_error, own["position_sd"]),
+                          (fit.axes_error, own["axes_sd"])):
+            if np.isfinite(error).all():
+                squares += float(np.sum((error / sd) ** 2))
+                number += 3
+    if number == 0 or squares < scipy.special.chdtri(number, _UNLIKELY):
+        return []
+    return ["positions and axes of the accelerometers, taken together, fit best "
+            f"{np.sqrt(squares / number):.2g} times as far from what is described as their sds "
+            "say, so what is stated is too small: a sensor whose scale is off by a percent does "
+            "that; calibrate it, or raise sensor.acc_position_sd and sensor.acc_axes_sd"]
 
 
 def _states(state, first):

@@ -14,6 +14,8 @@ from imu_fusion.parameters.declare import Parameters, param
 
 NAMES = ("rest", "entrainment", "ballistic flight", "impact", "steady flow", "rolling", "rest")
 
+_GAP = 3.0    # usual steps
+
 
 @dataclass(frozen=True)
 class PhaseParams(Parameters):
@@ -53,7 +55,7 @@ class Flight:
 
 def flights(time: np.ndarray, force: np.ndarray, gravity: float,
             params: PhaseParams = PhaseParams()) -> list[Flight]:
-    """Intervals in which only gravity acts.
+    """Intervals in which only gravity acts; a gap in the samples ends one, since nobody knows.
 
     Args:
         time: (n,) s. force: (n, 3) m/s^2, specific force of the ball's centre: at a rate of 35
@@ -62,7 +64,13 @@ def flights(time: np.ndarray, force: np.ndarray, gravity: float,
     size = scipy.ndimage.median_filter(np.linalg.norm(force, axis=1), 3, mode="nearest")
     free = np.concatenate([[False], size < params.free_fall * gravity, [False]])
     edges = np.flatnonzero(np.diff(free.astype(int))).reshape(-1, 2)
-    found = [Flight(float(time[a]), float(time[min(b, len(time) - 1)])) for a, b in edges]
+    steps = np.diff(time)
+    gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1
+    found = []
+    for a, b in edges:
+        inside = gaps[(gaps > a) & (gaps <= b)]
+        for begin, end in zip([a, *inside], [*(inside - 1), min(b, len(time) - 1)]):
+            found.append(Flight(float(time[begin]), float(time[end])))
     return [f for f in found if f.end - f.start >= params.flight_time]
 
 

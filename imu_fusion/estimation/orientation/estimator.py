@@ -20,6 +20,7 @@ from imu_fusion.estimation.orientation.fixed_interval import smooth
 from imu_fusion.estimation.orientation.fixed_lag import FixedLag
 from imu_fusion.estimation.orientation.gyro_limit import limits_of
 from imu_fusion.estimation.orientation.imu_rejection import are_imu_samples, is_imu_sample
+from imu_fusion.estimation.orientation.lost_turn import widen_after_gaps
 from imu_fusion.estimation.orientation.mag_rejection import is_mag_sample
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_GAP, ORIENTATION_DTYPE
@@ -355,6 +356,7 @@ class OrientationEstimator:
         after = mag_stamps >= origin
         written = smooth(self._state, self._par, imu.stamp, samples, mag_stamps[after],
                          mags[after], rows)
+        widen_after_gaps(rows[:written], self.params)
         return rows[:written]
 
     def _know_limits(self, found):

@@ -10,22 +10,24 @@ from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator
 from imu_fusion.estimation.orientation.gyro_limit import ranges_of
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
-from imu_fusion.estimation.orientation.rows import SATURATED_AXES_SHIFT
 from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import BAND
+from imu_fusion.sensors.unmixing import unmix
 
 
 def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLog:
     """The log with recovered rates and their standard deviation ``gyr_sd``.
 
-    The errors of a burst go together: n samples turn the body by n times the error of one, so that
-    white noise which does as much has sqrt(n) times its standard deviation. Over a long burst the
-    field holds the attitude: no more samples go together than turn the body by what its attitudes
-    at two instants are unsure.
+    The errors of a burst go together for as long as the spin remembers its acceleration: n samples
+    turn the body by n times the error of one, so that white noise which does as much has sqrt(n)
+    times its standard deviation. But meanwhile the field holds the attitude: they turn the body by
+    no more than its attitudes at two instants are unsure.
 
     While one axis is clipped, the others err, too: a calibration that mixes axes was applied to
-    what had been clipped. That error stands still in the sensor, so that it goes together for as
-    long as the body takes for half a turn.
+    what had been clipped. Where the tops tell how it mixes (:mod:`imu_fusion.sensors.unmixing`),
+    what was missing is mixed in once it is recovered, and all is recovered again. What is left of
+    misalignment stands still in the sensor: it goes together for as long as the body takes for
+    half a turn.
 
     Args:
         imu, mag: the whole recording. params: of method fusion; mode and range are set here.
@@ -36,17 +38,36 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLo
     if mag is None or not len(mag):
         raise EstimationError("rates beyond the gyroscope's range are recovered from the "
                               "magnetometer, and there is none: leave recover_rates false")
+    imu = imu[np.isfinite(imu.gyr).all(axis=1)]
     limits = (ranges_of(imu.gyr, kernel_parameters(params)) if params.sensor.gyro_range is None
               else np.broadcast_to(params.sensor.gyro_range, 3))
-    # Behind a calibration what was clipped is no longer flat.
-    at_limit = tuple(float(v) for v in np.where(np.isfinite(limits), (1.0 - BAND) * limits, 1e6))
-    estimator = OrientationEstimator(params.replace(
-        **{"mode": "smoothed", "sensor.gyro_range": at_limit}))
-    rows = np.concatenate([estimator.run(imu, mag), estimator.finish()])
-    missing = (rows["flags"][:, None] >> (SATURATED_AXES_SHIFT + np.arange(3))) & 1 == 1
-    sd = np.where(missing, _in_bursts(rows, missing),
-                  _beside_bursts(rows, missing, at_limit, params.sensor.gyro_scale_sd))
+    tops = unmix(imu.gyr, limits, BAND)
+    mixing = tops.matrix - np.eye(3)
+    rows, used = _fused(imu, mag, imu.gyr, tops.clipped, params)
+    if tops.known.any():
+        beyond = np.where(tops.clipped[used], rows["gyr"] - tops.seen[used], 0.0)
+        mixed = imu.gyr.copy()
+        mixed[used] += beyond @ mixing.T
+        rows, used = _fused(imu, mag, mixed, tops.clipped, params)
+    missing = tops.clipped[used]
+    recovered = np.where(missing, _in_bursts(rows, missing, params.fusion.angular_acc_time), 0.0)
+    mixed_in = recovered @ np.abs(mixing).T
+    sd = np.hypot(np.where(missing, recovered, mixed_in),
+                  _misaligned(rows, params.sensor.gyro_scale_sd))
     return ImuLog(rows["stamp"], rows["gyr"], rows["acc"], imu.frame_id, sd)
+
+
+def _fused(imu, mag, gyr, clipped, params):
+    """Rows of the smoothed filter of rates (n, 3) that are ``clipped`` (n, 3), and the indices of
+    the samples that they are of."""
+    # Flat tops that nothing else reaches: that is how the filter knows them.
+    top = 1.011 * np.abs(gyr).max(axis=0, initial=0.0) + 1e-3
+    flat = np.where(clipped, np.copysign(top, gyr), gyr)
+    estimator = OrientationEstimator(params.replace(
+        **{"mode": "smoothed", "sensor.gyro_range": tuple(float(v) for v in top)}))
+    rows = np.concatenate([estimator.run(ImuLog(imu.stamp, flat, imu.acc), mag),
+                           estimator.finish()])
+    return rows, np.searchsorted(imu.stamp, rows["stamp"])
 
 
 def _step(rows):
@@ -54,25 +75,24 @@ def _step(rows):
     return float(np.median(np.diff(rows["stamp"]))) * 1e-9
 
 
-def _in_bursts(rows, missing):
-    """(n, 3) rad/s, of rates that were recovered."""
+def _in_bursts(rows, missing, time):
+    """(n, 3) rad/s, of rates that were recovered; ``time`` s, for which their errors last."""
     single = np.sqrt(rows["cov_gyr"].diagonal(0, 1, 2))
     attitude = np.sqrt(2.0 * rows["cov_attitude"].diagonal(0, 1, 2))
-    together = np.maximum(attitude / np.maximum(single * _step(rows), 1e-12), 1.0)
-    return single * np.sqrt(np.minimum(together, _run_lengths(missing)))
+    step = _step(rows)
+    together = np.sqrt(np.minimum(max(time / step, 1.0), np.maximum(_run_lengths(missing), 1.0)))
+    return np.minimum(single * together, attitude / (step * together))
 
 
-def _beside_bursts(rows, missing, limits, mixing):
-    """(n, 3) rad/s, of rates that were measured while another axis was clipped; 0 where none was.
-
-    limits: (3,) rad/s. mixing: standard deviation of the calibration's off-diagonal entries.
-    """
-    beyond = np.where(missing, np.abs(rows["gyr"]) - np.array(limits), 0.0)
-    beyond = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)[:, None]
-    rate = np.linalg.norm(rows["gyr"], axis=1)[:, None]
-    half_turn = np.pi / np.maximum(rate * _step(rows), 1e-12)
-    run = _run_lengths(missing.any(axis=1)[:, None])
-    return mixing * beyond * np.sqrt(np.maximum(np.minimum(half_turn, run), 1.0)) * np.ones(3)
+def _misaligned(rows, misalignment):
+    """(n, 3) rad/s: what ``misalignment``, a standard deviation of off-diagonal entries of its
+    matrix, adds to the rates of a gyroscope that turns. In half a turn it adds up to 2 / pi of
+    what it would without turning."""
+    gyr = rows["gyr"]
+    square = np.sum(gyr ** 2, axis=1)[:, None]
+    half_turn = np.pi / np.maximum(np.sqrt(square) * _step(rows), 1e-12)
+    together = np.clip(half_turn, 1.0, len(rows))
+    return 2.0 / np.pi * misalignment * np.sqrt((square - gyr ** 2) * together)
 
 
 def _run_lengths(mask):

@@ -14,7 +14,8 @@ _LARGEST = 30.0       # s, on either side
 _GRID = 0.1           # s
 _SPAN = 10            # steps of the grid, over which changes are compared
 _FEWEST = 20          # changes
-_GAP = 3.0            # periods of the receiver, or spans, after which it says nothing between
+_GAP = 3.0            # periods of the receiver, or the span, after which it says nothing between
+_UPRIGHT = 0.5        # length of the mean of the vertical in the body's axes: less has tumbled
 _MOVING = 1.0         # m/s, from which on a velocity has a course
 _CORRELATION = 0.8    # at the best shift, at least
 _BETTER = 0.5         # of the unexplained squares at no shift, that the best may leave at most
@@ -43,6 +44,10 @@ def find_lag(samples: np.ndarray, velocity: VelocityLog | None) -> float:
     told = _told(grid, at, np.column_stack([course, vel]))
     moving = np.interp(grid, at, np.linalg.norm(vel[:, :2], axis=1)) > _MOVING
     told[~(moving[_SPAN:] & moving[:-_SPAN]), 0] = np.nan
+    vertical = turn.inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
+    if np.linalg.norm(vertical) < _UPRIGHT:
+        # The course of a body that tumbles does not turn with it.
+        return _best(felt[:, 1:], told[:, 1:])[1]
     return max(_best(felt[:, :1], told[:, :1]), _best(felt[:, 1:], told[:, 1:]))[1]
 
 
@@ -58,7 +63,7 @@ def _told(grid, at, values):
     """Changes of values (m, k) over a span behind each point of the grid, NaN outside and in
     gaps."""
     between = np.clip(np.searchsorted(at, grid), 1, len(at) - 1)
-    gap = at[between] - at[between - 1] > _GAP * max(np.median(np.diff(at)), _SPAN * _GRID)
+    gap = at[between] - at[between - 1] > max(_GAP * np.median(np.diff(at)), _SPAN * _GRID)
     values = np.column_stack([np.interp(grid, at, v, np.nan, np.nan) for v in values.T])
     values[gap] = np.nan
     return values[_SPAN:] - values[:-_SPAN]

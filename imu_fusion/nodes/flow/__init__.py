@@ -6,7 +6,7 @@ processes the session of somebody else). What makes it lossless:
 1. **DDS holds back.** Writers are RELIABLE KEEP_LAST 1000, readers in a session KEEP_ALL. After
    500 messages (or 16 MB) a writer waits until all are acknowledged; an acknowledged message is
    in the queue of the reader. A full queue acknowledges nothing. In a node between, what may not
-   leave waits, and while anything waits the node does not take: its queues fill, its writers stop.
+   leave waits, and while 500 wait the node does not take: its queues fill, its writers stop.
 2. **Each node says what it does**, on one latched topic of its own, ``<node>/_flow/<instance>``
    (diagnostic_msgs/DiagnosticArray, :class:`State`): which session it sends, with a writer and
    counts for each topic, and which sessions it has joined and finished. Always all of it: who

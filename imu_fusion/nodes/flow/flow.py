@@ -14,7 +14,7 @@ from imu_fusion.nodes.flow.source import Output, Source
 from imu_fusion.nodes.flow.state import END, State
 
 _LOOK_EVERY = 0.1  # s
-_SERVE_EVERY = 0.05  # s
+_SERVE_EVERY = 0.1  # s
 _POLL = 0.002  # s, between looks whether all is acknowledged
 
 
@@ -62,7 +62,7 @@ class Flow:
     def input(self, msg_type: type, topic: str, qos: QoSProfile | None = None,
               wakes: bool = True) -> Input:
         """A subscription; outside sessions with ``qos``, and there messages that do not wake the
-        node are taken with the next that does, or 50 ms later."""
+        node are taken with the next that does, or 100 ms later."""
         return self.sink.input(msg_type, topic, qos, wakes)
 
     def send(self) -> bool:

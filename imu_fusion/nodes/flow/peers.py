@@ -9,7 +9,15 @@ from dataclasses import replace
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from imu_fusion.nodes.flow.qos import AT_ONCE, PARTICIPANT, SILENT, full_name, gid, made
+from imu_fusion.nodes.flow.qos import (
+    AT_ONCE,
+    PARTICIPANT,
+    SILENT,
+    Endpoints,
+    full_name,
+    gid,
+    made,
+)
 from imu_fusion.nodes.flow.state import MARK, STATE_QOS, State
 
 PATIENCE = 10.0  # s, for one that says nothing, or two that say it; longer than a lease
@@ -56,6 +64,7 @@ class Peers(dict[str, Peer]):
         self._publisher, own_gid = made(node.get_publishers_info_by_topic, self.own, lambda: (
             node.create_publisher(DiagnosticArray, self.own, STATE_QOS, event_callbacks=SILENT)))
         self.participant = own_gid[:PARTICIPANT]
+        self._publishers = Endpoints(node.count_publishers, node.get_publishers_info_by_topic)
         self.problems: list[str] = []
         self._said: State | None = None
         self._given_up: set[str] = set()
@@ -90,7 +99,7 @@ class Peers(dict[str, Peer]):
                 self._examine(peer)
 
     def _writers(self, topic):
-        return {gid(info) for info in self.node.get_publishers_info_by_topic(topic)}
+        return {gid(info) for info in self._publishers[topic]}
 
     def _listen(self, peer):
         if peer.subscription is not None:

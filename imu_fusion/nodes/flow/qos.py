@@ -1,5 +1,6 @@
 """QoS of data, timers of real time, and names of endpoints in the graph."""
 
+import time
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -65,6 +66,30 @@ def gid(info: TopicEndpointInfo) -> str:
 
 
 PARTICIPANT = 24
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # as rmw calls it: endpoints are discovered before their names
+_KEPT = 1.0  # s
+
+
+class Endpoints:
+    """Those of a topic, as the graph shows them. To be told of them takes a hundred times as long
+    as to count them: so they are asked for when their number changes, and once a second.
+
+    Args:
+        count, infos: of a node, both ask by topic.
+    """
+
+    def __init__(self, count: Callable[[str], int],
+                 infos: Callable[[str], list[TopicEndpointInfo]]) -> None:
+        self._count, self._infos = count, infos
+        self._known: dict[str, tuple[float, list[TopicEndpointInfo]]] = {}
+
+    def __getitem__(self, topic: str) -> list[TopicEndpointInfo]:
+        asked, found = self._known.get(topic, (float("-inf"), []))
+        if (len(found) != self._count(topic) or time.monotonic() - asked > _KEPT
+                or any(info.node_name == UNKNOWN_NODE for info in found)):
+            found = self._infos(topic)
+            self._known[topic] = time.monotonic(), found
+        return found
 
 
 def made(infos: Callable[[str], list], topic: str, make: Callable[[], E],

@@ -18,7 +18,7 @@ from imu_fusion.nodes.flow.state import BEGIN, END, NEXT, Joined, Sending, Taken
 
 AT_ONCE = 2000  # messages of one topic that are taken in one turn
 # s, in which a block grows: in a session; live, for what was sent together; where nobody waits.
-NAP, NAP_LIVE, NAP_PATIENT = 0.002, 0.0003, 0.02
+NAP, NAP_LIVE, NAP_PATIENT = 0.002, 0.001, 0.02
 SHARED = ("/tf", "/tf_static")  # topics on which others' messages are no fault
 SILENCE = 5.0  # s, after which what is missing at the end counts as lost
 REPORT_BYTES = 16e6  # taken, after which that is said; see QUEUED_BYTES of a source
@@ -165,7 +165,7 @@ class Sink:
         self.inputs: dict[str, Input] = {}
         self.sessions: dict[str, Session] = {}  # by instance of the sender
         self.gate = _Gate(lambda: self.feeds is None or self.feeds.ready())
-        self.woken = False
+        self.woken = self._is_flowing = False
         self._hold, self._on_begin = hold, on_begin
         self._begun = False
         self._left: dict[str, int] = {}  # broken session -> its version then
@@ -240,6 +240,9 @@ class Sink:
         handles = [i.subscription.handle for i in self.inputs.values() if i.wakes or i.sessions]
         if not handles or not self.gate.can_execute(None):
             return False
+        if self._is_flowing:  # more follow: a nap costs less than waiting for them
+            self.woken = True
+            return True
         with ExitStack() as held:
             for handle in (*handles, self.node.context.handle):
                 held.enter_context(handle)
@@ -253,8 +256,9 @@ class Sink:
 
     def take(self) -> Turn:
         """One turn: all that waits on all topics."""
+        in_session = bool(self.feeding())
         if self.woken:
-            time.sleep(NAP if self.feeding() else self._nap)
+            time.sleep(NAP if in_session else self._nap)
         self.woken = False
         turn = Turn()
         if self._begun:
@@ -270,6 +274,7 @@ class Sink:
             if topic_input.is_complete():
                 turn.ended.append(topic)
                 turn.lost += self._compare(topic_input)
+        self._is_flowing = in_session and bool(turn.blocks)
         if turn.ended:
             turn.over = [s for s in self.feeding() if s.has_ended
                          and not any(s in self.inputs[t].sessions for t in s.topics)]

@@ -14,6 +14,8 @@ from imu_fusion.nodes.flow.peers import Peers
 from imu_fusion.nodes.flow.qos import (
     AT_ONCE,
     SILENT,
+    UNKNOWN_NODE,
+    Endpoints,
     full_name,
     gid,
     made,
@@ -28,7 +30,6 @@ QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
 SETTLING = 1.0  # s without anybody new, after which all who are there are taken to be known
 
-UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # as rmw calls it
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
 
@@ -57,18 +58,18 @@ class Output:
         self.sent = self.start = self.bytes = 0
         self._flight = self._flight_bytes = 0
 
-    def publish(self, message: Any) -> None:
-        """Send a message (or its CDR bytes) now, or as soon as it may leave."""
-        if self.waiting or not self.is_open():
-            self.waiting.append(message)
-        else:
-            self._send(message)
+    def publish(self, *messages: Any) -> None:
+        """Send messages (or their CDR bytes) now, or as soon as they may leave."""
+        is_shut = bool(self.waiting)
+        self.waiting.extend(messages)
+        if not is_shut:
+            self.drain()
 
     def is_open(self) -> bool:
         """Whether a message would leave at once."""
         if self._source.phase != _OPEN:
             return self._source.phase == _LIVE
-        if self._flight < WINDOW and self._flight_bytes < WINDOW_BYTES:
+        if self._has_room():
             return True
         taken = self._source.taken(self.topic)
         if taken is not None and (self.sent - taken) * self.bytes > QUEUED_BYTES * self.sent:
@@ -91,15 +92,25 @@ class Output:
 
     def drain(self) -> None:
         """Send what waits, as far as it may leave."""
+        handle, is_live = self._publisher.handle, self._source.phase == _LIVE
         while self.waiting and self.is_open():
-            self._send(self.waiting.popleft())
+            with handle:  # as Publisher.publish does, but once for many
+                self._send(handle, self.waiting.popleft())
+                while self.waiting and (is_live or self._has_room()):
+                    self._send(handle, self.waiting.popleft())
 
-    def _send(self, message):
-        self._publisher.publish(message)
-        self.sent += 1
-        if isinstance(message, bytes | memoryview):
+    def _has_room(self):
+        """Whether the window is not full."""
+        return self._flight < WINDOW and self._flight_bytes < WINDOW_BYTES
+
+    def _send(self, handle, message):
+        if isinstance(message, bytes):
+            handle.publish_raw(message)
             self._flight_bytes += len(message)
             self.bytes += len(message)
+        else:
+            handle.publish(message)
+        self.sent += 1
         self._flight += 1
 
 
@@ -123,6 +134,8 @@ class Source:
         self.foreign: dict[str, list[str]] = {}
         self.company: set[str] = set()  # instances that must have joined
         self._wait_for = {name if name.startswith("/") else "/" + name for name in wait_for}
+        self._subscriptions = Endpoints(self.node.count_subscribers,
+                                        self.node.get_subscriptions_info_by_topic)
         self._seen: set[str] = set()  # instances, and gids of readers that may be of others
         # When anybody new was seen last.
         self._news_at = float("-inf") if wait_for else time.monotonic()
@@ -170,9 +183,10 @@ class Source:
             self.advance()
 
     def ready(self) -> bool:
-        """Whether every topic may send (always, without a session)."""
-        return self.phase == _LIVE or not self._begin_after and all(
-            not output.waiting and output.is_open() for output in self.outputs.values())
+        """Whether more may be made: no topic has a window's worth waiting (without a session:
+        always). While the last window is acknowledged, the next one is made."""
+        return self.phase == _LIVE or (self.is_settled() and all(
+            len(output.waiting) < WINDOW for output in self.outputs.values()))
 
     def is_settled(self) -> bool:
         """Whether a session is open which all have joined."""
@@ -180,7 +194,8 @@ class Source:
 
     def is_shut(self) -> bool:
         """Whether something waits for acknowledgements, whose coming wakes nobody."""
-        return self.phase == _OPEN and (bool(self._event) or not self.ready())
+        return self.phase == _OPEN and (bool(self._event) or not all(
+            output.is_open() for output in self.outputs.values()))
 
     def drained(self) -> bool:
         """Whether no session is open: all who joined have everything."""
@@ -332,10 +347,9 @@ class Source:
         seen = set() if self._wait_for or self.upstream else set(self.peers)
         self.foreign = {}
         for topic in self.outputs:
-            others = [info for info in self.node.get_subscriptions_info_by_topic(topic)
+            others = [info for info in self._subscriptions[topic]
                       if full_name(info) not in ours]
             seen |= set(map(gid, others))
-            # A node's endpoints are discovered before its name.
             names = {full_name(info) for info in others if info.node_name != UNKNOWN_NODE}
             if names:
                 self.foreign[topic] = sorted(names)

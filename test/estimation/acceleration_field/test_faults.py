@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import LayoutError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
@@ -108,7 +109,6 @@ def test_two_that_are_exchanged_are_not_passed_over(impact):
 
 def test_a_mounting_within_its_sd_is_found(impact):
     # 5 deg where 2 deg are expected: within what is plausible, so it is used and estimated.
-    from scipy.spatial.transform import Rotation
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(5.0)])
     readings = felt(impact)
     readings[:, 2] = turn.inv().apply(readings[:, 2])
@@ -135,6 +135,95 @@ def test_a_hard_impact_is_not_blamed_on_the_mounting(modulus, mode):
                                             np.linalg.inv(rows["cov_omega"][20:]), error)))
         assert np.abs(error).max() < 0.6 and estimator.remarks() == []
     assert np.mean(normalised) < 4
+
+
+def test_noise_that_alternates_does_not_hide_an_impact():
+    # Chance makes it so now and then; the fall ends with 135 g within 8 ms.
+    motion = simulate(ImpactScene(modulus=1e7, ground=0.6, velocity=(0.75, 0.0, -3.0), mass=4.5),
+                      duration=0.1, step=1e-5, every=100)
+    readings = motion.readings(PAPER_POSITIONS, PAPER_AXES)
+    sizes = np.abs(np.random.default_rng(4).normal(0.0, NOISE, readings.shape[1:]))
+    signs = np.where(np.arange(len(motion.t)) % 2 == 0, 1.0, -1.0)
+    estimator = AccelerationFieldEstimator(PARAMS, layout())
+    rows = estimator.run(motion.stamp, readings + signs[:, None, None] * sizes)
+    error = (rows["omega"] - motion.omega)[20:]
+    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_omega"][20:]),
+                             error)) < 4
+
+
+def rig(motion, places, axes, measured, seed):
+    """(AccelerometerParams of a rig as described, readings (n, N, 3) of it as it was built)."""
+    random = np.random.default_rng(seed)
+    rate = 1.0 / (motion.t[1] - motion.t[0])
+    sensors = [AccelerometerParams(position=tuple(place), axes=tuple(own.ravel()), bias_sd=0.1,
+                                   measured_axes=tuple(letters), noise_density=NOISE / rate ** 0.5)
+               for place, own, letters in zip(places, axes, measured)]
+    turns = Rotation.from_rotvec(0.035 * random.standard_normal(places.shape))
+    readings = motion.readings(CENTRE + places + 1e-3 * random.standard_normal(places.shape),
+                               (turns * Rotation.from_matrix(axes)).as_matrix())
+    readings += random.normal(0.0, 0.1, (1, *readings.shape[1:]))
+    return sensors, readings + random.normal(0.0, NOISE, readings.shape)
+
+
+def test_a_blow_in_one_direction_is_as_wild_as_that():
+    # Twelve single axes at 2 kHz: five components that fit must not hide the sixth.
+    motion = simulate(ImpactScene(modulus=1e6, ground=0.6, velocity=(0.75, 0.0, -3.0), mass=4.5),
+                      duration=0.15, step=1e-5, every=50)
+    random = np.random.default_rng(0)
+    random.uniform(size=18)
+    places, axes = random.uniform(-0.12, 0.12, (12, 3)), Rotation.random(12, random_state=0)
+    normalised = []
+    for seed in range(3):
+        sensors, readings = rig(motion, places, axes.as_matrix(), ["x"] * 12, seed)
+        rows = AccelerationFieldEstimator(PARAMS.replace(sample_rate=2000.0), sensors).run(
+            motion.stamp, readings)
+        error = (rows["omega"] - motion.omega)[20:]
+        normalised.append(np.mean(np.einsum(
+            "ni,nij,nj->n", error, np.linalg.inv(rows["cov_omega"][20:]), error)))
+    assert np.mean(normalised) < 9
+
+
+def test_what_is_left_of_an_array_does_not_run_away():
+    # Without the one that reads a tenth of what it should, seven channels do not tell the rate.
+    motion = simulate(duration=1.0, step=2.5e-5, every=80)
+    places = np.array([[0.0, 0.0, 0.08], [0.0, 0.1, 0.0], [0.15, 0.0, 0.0], [-0.15, 0.02, 0.03]])
+    axes = np.vstack([Rotation.random(3, random_state=0).as_matrix(),
+                      Rotation.random(1, random_state=0).as_matrix()])
+    for seed in (4, 5):
+        sensors, readings = rig(motion, places, axes, ["xyz", "xyz", "xyz", "x"], seed)
+        readings[:, 1] *= 0.1
+        readings[:, 3, 1:] = np.nan
+        estimator = AccelerationFieldEstimator(PARAMS.replace(sample_rate=500.0), sensors)
+        rows = estimator.run(motion.stamp, readings)
+        assert np.abs(rows["omega"] - motion.omega).max() < 60.0
+        assert any("accelerometer '1' contradicts" in text for text in estimator.remarks())
+
+
+def test_scales_that_are_off_are_told(impact):
+    # By the noise that they seem to be, or the mountings that would explain them.
+    scales = 1.0 + 0.01 * np.random.default_rng(0).standard_normal((1, 4, 3))
+    for readings, told in ((felt(impact), False), (felt(impact) * scales, True)):
+        estimator = AccelerationFieldEstimator(PARAMS, layout())
+        estimator.run(impact.stamp, readings)
+        assert any("scale is off by a percent" in text for text in estimator.remarks()) is told
+
+
+def test_lost_samples_are_no_limit(impact):
+    random = np.random.default_rng(1)
+    readings = felt(impact)
+    for k in (1, 2):
+        readings[random.random(len(readings)) < 0.3, k] = np.nan
+    estimator = AccelerationFieldEstimator(PARAMS, layout())
+    rows = estimator.run(impact.stamp, readings)
+    assert estimator.limits_found == {} and not np.any(rows["flags"] & SATURATED)
+
+
+def test_steps_that_are_coarser_than_the_noise_are_told(impact):
+    fine, coarse = felt(impact), np.round(felt(impact) / 2.0) * 2.0
+    for readings, told in ((fine, False), (coarse, True)):
+        estimator = AccelerationFieldEstimator(PARAMS, layout())
+        estimator.run(impact.stamp, readings)
+        assert any("in steps of 2 m/s^2" in text for text in estimator.remarks()) is told
 
 
 @pytest.mark.parametrize("jitter", ["own", "common"])

@@ -18,7 +18,8 @@ from imu_fusion.parameters.file import parameters_for
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer
 from imu_fusion.simulation.avalanche import Avalanche
 from imu_fusion.simulation.ball_sensors import LEVER_ARM, BallErrors, record_ball
-from imu_fusion.streams.smoother import SmootherNodeParams, SmoothingParams, recovery_params
+from imu_fusion.streams.smoother import recovery_params
+from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 from imu_fusion.surfaces.file import load_surface
 from test.documents import ROOT
 
@@ -69,6 +70,15 @@ def test_phases_of_perfect_signals(avalanche, plane):
     assert "free fall" in found[1].reason and " g " in found[3].reason
     first = flights(samples.time, force, avalanche.gravity)[0]
     assert (first.start, first.end) == pytest.approx((true[1].start, true[2].start), abs=0.05)
+
+
+def test_a_flight_ends_where_the_samples_do():
+    time = np.r_[np.arange(0.0, 2.0, 0.01), np.arange(2.5, 4.0, 0.01)]
+    force = np.full((len(time), 3), 6.0)
+    force[(time > 1.7) & (time < 2.8)] = 0.1
+    first, second = flights(time, force, 9.8)
+    assert (first.start, first.end) == pytest.approx((1.71, 1.99), abs=0.011)
+    assert (second.start, second.end) == pytest.approx((2.5, 2.8), abs=0.011)
 
 
 def test_phases_that_are_not_there_are_left_out(avalanche):

@@ -9,7 +9,7 @@ from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.samples.logs import FixLog, VelocityLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, PhoneErrors, record
-from imu_fusion.streams.smoother import SmoothingParams
+from imu_fusion.streams.smoother_params import SmoothingParams
 
 #: Another value of each parameter, and what has to be set with it.
 CHANGED = {

@@ -1,0 +1,37 @@
+"""The turn about the field, which a long gap in the samples of a tumbling body takes away.
+
+Linear errors do not describe a body that may have turned by more than a radian: what a filter then
+states of the turn about the field shrinks, though nothing tells it. Where the accelerometer is not
+used, that turn stays unknown.
+"""
+
+import numpy as np
+import scipy  # its parts are loaded where they are first used
+
+from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
+from imu_fusion.estimation.orientation.params import OrientationParams
+
+#: rad, by which a body may turn unseen before linear errors describe it no longer.
+LOST = 1.0
+
+
+def unseen_turn(params: OrientationParams, gap: float) -> float:
+    """rad by which the body may have turned in ``gap`` s without samples; 0 in shorter ones than
+    gap.max, and in those after which all starts anew."""
+    return params.gap.rate_sd * gap if params.gap.max < gap <= params.gap.restart else 0.0
+
+
+def widen_after_gaps(rows: np.ndarray, params: OrientationParams) -> None:
+    """State in rows (n,) ORIENTATION_DTYPE, in place, that from a gap on in which the body may have
+    turned by more than :data:`LOST` the turn about the field is any."""
+    steps = np.diff(rows["stamp"]) * 1e-9
+    lost = np.flatnonzero([unseen_turn(params, step) > LOST for step in steps.tolist()])
+    if params.fusion.use_acc or not len(lost):
+        return
+    after = rows[lost[0] + 1:]
+    seen = after["mag_world"][np.isfinite(after["mag_world"]).all(axis=1)]
+    if not len(seen):
+        return
+    field_imu = scipy.spatial.transform.Rotation.from_quat(after["quat_world_imu"]).inv().apply(
+        seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0)))
+    after["cov_attitude"] += UNIFORM_VARIANCE * field_imu[:, :, None] * field_imu[:, None, :]
