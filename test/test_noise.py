@@ -8,6 +8,7 @@ from imu_fusion.calibrate.noise import noise_of, noise_parameters, recorded_nois
 from imu_fusion.errors import CalibrationError
 from imu_fusion.messages.convert import imu_message
 from imu_fusion.recordings.bag_writer import BagWriter
+from test.sources.test_exports import at_hand, convert
 
 pytest.importorskip("allantools")
 RATE = 50.0
@@ -42,3 +43,16 @@ def test_white_noise_shows_no_walk_and_a_knock_is_said(tmp_path):
     assert sum("60 s show white noise" in text for text in remarks) == 2
     values = yaml.safe_load(noise_parameters(found, "bag"))["/**"]["ros__parameters"]
     assert values["sensor.gyro_noise_density"] == pytest.approx(1e-3 / np.sqrt(50), rel=0.15)
+
+
+def test_a_static_log_of_an_avanode(tmp_path):
+    """Densities are the scatter of its samples over the root of half its rate, as white noise has
+    it, for a bandwidth of 200 Hz: .0075 deg/s/sqrt(Hz) and .33 mg/sqrt(Hz); biases below 1.1 deg/s.
+    Of fourteen seconds it says that they tell nothing else."""
+    assert convert(at_hand("avanode/C03LData001.txt"), tmp_path / "bag")[0] == 0
+    found, remarks = recorded_noise(tmp_path / "bag")
+    gyr, acc, _ = found
+    assert np.degrees(gyr.density) == pytest.approx([0.0075] * 3, rel=0.4)
+    assert acc.density[:2] / 9.80665 == pytest.approx([0.33e-3] * 2, rel=0.4)
+    assert np.degrees(np.abs(gyr.mean)).max() < 1.1
+    assert any("gyroscope: 14 s show white noise" in text for text in remarks)

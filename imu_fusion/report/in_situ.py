@@ -70,18 +70,18 @@ def in_situ_blocks(reckoned: Reckoned) -> list[Block]:
 
 def _sweep(reckoned):
     found = sweep(reckoned.samples, reckoned.constraint, list(_RHOS))
-    figure = make_subplots(rows=1, cols=3, horizontal_spacing=0.09)
-    for column, (name, color) in enumerate((("objective", fig.ESTIMATE), ("violation",
-                                                                          fig.HIGHLIGHT),
-                                            ("condition", fig.REFERENCE)), 1):
+    figure = make_subplots(rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    for row, (name, label, color) in enumerate((
+            ("objective", "objective, m\u00b2", fig.ESTIMATE),
+            ("violation", "off slope, m", fig.HIGHLIGHT),
+            ("condition", "condition", fig.REFERENCE)), 1):
         figure.add_trace(go.Scatter(
             x=np.float32(_RHOS), y=np.float32(np.array([getattr(f, name) for f in found])),
-            name=name, mode="lines+markers", line=dict(color=color, width=1.5)), row=1, col=column)
-    fig.style(figure, height=330)
-    figure.update_layout(legend=dict(orientation="h", x=0, y=1.0, yanchor="bottom"))
-    figure.update_xaxes(type="log", title_text="\u03c1")
+            name=name, mode="lines+markers", line=dict(color=color, width=1.5)), row=row, col=1)
+        figure.update_yaxes(title_text=label, row=row, col=1)
+    fig.style(figure, height=520)
+    figure.update_layout(showlegend=False)
+    figure.update_xaxes(type="log")
+    figure.update_xaxes(title_text="\u03c1", row=3, col=1)
     figure.update_yaxes(type="log")
-    for column, label in enumerate(("objective in m\u00b2", "off the slope, RMS, in m",
-                                    "condition"), 1):
-        figure.update_yaxes(title_text=label, row=1, col=column)
     return figure

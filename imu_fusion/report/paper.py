@@ -132,6 +132,8 @@ def _draw_frame(panel, figure, number, traces):
     for axis, name in ((layout[f"xaxis{number}"], "x"), (layout[f"yaxis{number}"], "y")):
         if axis.title.text:
             panel.set(**{f"{name}label": _text(axis.title.text)})
+        if axis.type == "log":
+            panel.set(**{f"{name}scale": "log"})
     if layout[f"yaxis{number}"].rangemode == "tozero":
         panel.set_ylim(bottom=0.0)
     for shape in layout.shapes:

@@ -88,7 +88,10 @@ def _algebraic(m):
 
     Raises CalibrationError where the quadric is no ellipsoid.
     """
-    x, y, z = m.T
+    # The quadric's constant is put to one: an origin on the ellipsoid, where hard iron is as strong
+    # as the field, would have none.
+    middle = 0.5 * (m.min(axis=0) + m.max(axis=0))
+    x, y, z = (m - middle).T
     design = np.column_stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z,
                               2 * x, 2 * y, 2 * z])
     p, *_ = np.linalg.lstsq(design, np.ones(len(m)), rcond=None)
@@ -98,7 +101,7 @@ def _algebraic(m):
         shape = quadric / (1.0 + centre @ quadric @ centre)
         values, vectors = np.linalg.eigh(shape)
         if values.min() > 0:
-            return centre, (vectors * np.sqrt(values)) @ vectors.T
+            return centre + middle, (vectors * np.sqrt(values)) @ vectors.T
     raise CalibrationError(
         "magnetometer calibration: the samples fit no ellipsoid; turn the sensor through more "
         "directions, away from iron, and check that the samples are in tesla")

@@ -55,7 +55,7 @@ class ImpactScene:
 # Fig. 4: four accelerometers and the particle whose acceleration Table 1 compares.
 PAPER_POSITIONS = np.array([[0, 0, 0.83], [0, 0.10, 0.75], [0.15, 0, 0.75], [-0.15, 0, 0.75]])
 PAPER_PARTICLE = np.array([0.0, 0.0, 0.67])
-# Signs of the sensor axes along the body axes; found by matching Table 1, not printed.
+# Signs of the sensor axes along the body axes: which the paper has is not printed.
 PAPER_AXES = np.array([np.diag(s) for s in
                        ([1, -1, 1], [1, 1, -1], [1, 1, 1], [1, -1, -1])], dtype=float)
 

@@ -7,6 +7,7 @@ integration error at any sampling rate. The motion fades in from rest.
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,13 +18,21 @@ from imu_fusion.samples.logs import ImuLog, MagLog, PoseLog
 GRAVITY = 9.80665
 
 
-def _fade(t, start, length):
+def smooth_step(t: np.ndarray, start: float,
+                length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Smooth step from 0 at ``start`` to 1 at ``start + length``: value, 1st, 2nd derivative."""
     s = np.clip((t - start) / length, 0.0, 1.0)
     inside = (s > 0) & (s < 1)
     return (s ** 3 * (10 - 15 * s + 6 * s * s),
             np.where(inside, 30 * s * s * (1 - s) ** 2, 0.0) / length,
             np.where(inside, 60 * s * (1 - s) * (1 - 2 * s), 0.0) / length ** 2)
+
+
+class Motion(Protocol):
+    """What :func:`simulate` needs to know of a motion."""
+
+    def truth(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """As of :meth:`Tumbling.truth`."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +68,7 @@ class Tumbling:
         amplitude = rng.uniform(0.5, 1.5, (2, 3, self.waves)) / math.sqrt(self.waves / 2)
         amplitude[0] *= self.rate_sd / frequency[0]
         amplitude[1] *= self.travel_sd
-        fade, fade1, fade2 = (f[:, None] for f in _fade(t, self.rest, self.fade))
+        fade, fade1, fade2 = (f[:, None] for f in smooth_step(t, self.rest, self.fade))
 
         def waves(row):
             arg = frequency[row] * t[:, None, None] + phase[row]
@@ -118,14 +127,14 @@ def earth_field(norm: float = 48e-6, inclination: float = math.radians(63.0),
                      -norm * math.sin(inclination)])
 
 
-def simulate(motion: Tumbling, duration: float, *, rate: float = 200.0,
+def simulate(motion: Motion, duration: float, *, rate: float = 200.0,
              mag_rate: float | None = None, sensors: Sensors = Sensors(),
              field_world: ArrayLike | None = None,
              seed: int = 0) -> tuple[ImuLog, MagLog, PoseLog, np.ndarray]:
     """Logs of an IMU and a magnetometer on a tumbling body.
 
     Args:
-        motion: Tumbling. duration: s. rate, mag_rate: Hz (mag_rate unset: rate).
+        motion: what moves. duration: s. rate, mag_rate: Hz (mag_rate unset: rate).
         sensors: Sensors. field_world: (3,) tesla. seed: of the noise.
 
     Returns:

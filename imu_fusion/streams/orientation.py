@@ -174,7 +174,11 @@ class OrientationStream(Stream):
         return made + self._write(self.estimator.finish())
 
     def conclude(self) -> Conclusion:
-        return Conclusion(results={"units": UNITS} | self.estimator.summary())
+        return Conclusion(results={"units": UNITS} | self.estimator.summary(),
+                          remarks=self.remarks())
+
+    def remarks(self) -> list[str]:
+        return self.estimator.remarks()
 
     def change(self, params: OrientationParams) -> None:
         """Go on with other values of parameters that may change at run time."""

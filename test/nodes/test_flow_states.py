@@ -1,9 +1,11 @@
 """What others say of their sessions, and who is believed; see imu_fusion/nodes/flow/peers.py."""
 
+from types import SimpleNamespace
+
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from imu_fusion.nodes.flow import END, peers
+from imu_fusion.nodes.flow import END, peers, qos
 from imu_fusion.nodes.flow.qos import gid
 from imu_fusion.nodes.flow.state import BEGIN, MARK, STATE_QOS, Sending, Sent, State
 from test.nodes.flow_parts import Receiver, Sender
@@ -101,3 +103,25 @@ def test_the_state_of_another_is_said_by_its_own_writer(graph):
     info, = receiver.node.get_publishers_info_by_topic(instance)
     graph.until(lambda: receiver.flow.peers[instance].state is not None)
     assert receiver.flow.peers[instance].writer == gid(info)
+
+
+def test_endpoints_are_asked_for_when_their_number_changes_and_until_all_have_names(monkeypatch):
+    there, asked = [SimpleNamespace(node_name="a")], []
+
+    def infos(topic):
+        asked.append(topic)
+        return list(there)
+
+    endpoints = qos.Endpoints(lambda topic: len(there), infos)
+    assert endpoints["/x"] == endpoints["/x"] == there and asked == ["/x"]
+    there.append(SimpleNamespace(node_name=qos.UNKNOWN_NODE))
+    for _ in range(2):
+        assert endpoints["/x"] == there
+    assert len(asked) == 3
+    there[1].node_name = "b"
+    for _ in range(3):
+        assert endpoints["/x"] == there
+    assert len(asked) == 3
+    monkeypatch.setattr(qos, "_KEPT", -1.0)    # the time is over
+    there[1] = SimpleNamespace(node_name="c")
+    assert endpoints["/x"] == there

@@ -36,6 +36,16 @@ def test_exact_samples_give_the_exact_calibration():
     assert c.field_norm == pytest.approx(NORM)
 
 
+@pytest.mark.parametrize("share", [0.9, 1.0, 1.1, 3.0])
+def test_hard_iron_may_be_as_strong_as_the_field(share):
+    """The origin then lies on the ellipsoid, or near it, or outside."""
+    rng = np.random.default_rng(6)
+    m = distorted(sphere(300, rng), 3e-7, rng) - OFFSET
+    iron = share * NORM * np.linalg.inv(SOFT) @ np.array([0.6, 0.0, 0.8])
+    c = calibrate_magnetometer(m + iron, field_norm=NORM)
+    assert c.offset == pytest.approx(iron, abs=2e-7)
+
+
 def test_without_a_norm_the_determinant_is_one():
     c = calibrate_magnetometer(distorted(sphere(300, np.random.default_rng(1))))
     assert np.linalg.det(c.matrix) == pytest.approx(1.0)

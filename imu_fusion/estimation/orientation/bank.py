@@ -70,11 +70,21 @@ def part(state, par):
 @njit
 def weights(state, par):
     """Weights (k,) of the hypotheses by what was measured so far; the sum is 1, those that are
-    negligible, or still one with another, are 0."""
+    negligible, or still one with another, are 0.
+
+    A hand that is carried further than it was said to be looks like laps: where accelerations last,
+    positions are as likely as under the likeliest other hypothesis.
+    """
     out = np.full(len(state), -math.inf)
-    for k in range(len(state)):
-        if state[k].started and state[k].stamp == state[0].stamp:
-            out[k] = state[k].log_likelihood / _REPEATS + par[k].log_prior
+    placed, best = 0.0, -math.inf
+    for lasting in (False, True):
+        for k in range(len(state)):
+            if (state[k].started and state[k].stamp == state[0].stamp
+                    and (par[k].lasting_acc_sd > 0.0) == lasting):
+                positions = placed if lasting else state[k].position_likelihood
+                out[k] = (state[k].log_likelihood + positions) / _REPEATS + par[k].log_prior
+                if not lasting and out[k] > best:
+                    placed, best = positions, out[k]
     largest = out.max()
     total = 0.0
     for k in range(len(state)):

@@ -220,11 +220,11 @@ class OrientationEstimator:
         """After a gap in which anything can have happened: rows that still wait, then align
         anew, at the yaw of before if nothing tells another."""
         rows = self.finish()
+        best = self._likeliest()
         if self._alignment is not None:
-            likeliest = self._state[bank.likeliest(bank.weights(self._state, self._par))]
-            self._yaw = quat_to_rpy(likeliest["quat_world_imu"])[2]
+            self._yaw = quat_to_rpy(self._state["quat_world_imu"][best])[2]
         corrected = self.take_corrected()
-        self._counted = self._counts()
+        self._counted = self._counts(best)
         self._counted["gaps"] += 1
         self._forget()
         self._state["waiting_flags"] |= FLAG_GAP
@@ -273,7 +273,7 @@ class OrientationEstimator:
         s, par, a = self._state[best], self._par[0], self._alignment
         counts = dict(
             method=self.params.method, aligned=a is not None,
-            **{name: int(value) for name, value in zip(COUNT_NAMES, self._counts()[0])})
+            **{name: int(value) for name, value in zip(COUNT_NAMES, self._counts(best)[0])})
         if a is None:
             return counts
         return counts | dict(
@@ -295,15 +295,27 @@ class OrientationEstimator:
             gyro_delay=float(par["gyro_delay"]),
             mag_delay=float(par["gyro_delay"] + s["mag_lag"]))
 
+    def remarks(self) -> list[str]:
+        """What makes the estimates so far doubtful, and what to do about it."""
+        realigned = int(self._counts(self._likeliest())["realigned"][0])
+        return [
+            f"{realigned} time{'s' * (realigned != 1)} rates and forces stood still where the "
+            "estimate took its gyroscope to turn: bias and attitude were wrong by more than they "
+            "were stated to be, and begin anew there; begin at rest, calibrate the gyroscope "
+            "(imu_fusion calibrate gyroscope) or raise sensor.gyro_bias_sd"] if realigned else []
+
+    def _likeliest(self):
+        return bank.likeliest(bank.weights(self._state, self._par))
+
     def _weight_of(self, name, weight, best):
         """Weight of all hypotheses that agree with the likeliest one in a parameter."""
         return float(weight[self._par[name] == self._par[name][best]].sum())
 
-    def _counts(self):
-        """Counts of the present stretch and of those before it, (1,) COUNTS."""
+    def _counts(self, hypothesis):
+        """Counts of the present stretch, by one hypothesis, and of those before it, (1,) COUNTS."""
         total = self._counted.copy()
         for name in COUNT_NAMES:
-            total[name] += self._state["counts"][name][0]
+            total[name] += self._state["counts"][name][hypothesis]
         return total
 
     def _step(self, stamp):

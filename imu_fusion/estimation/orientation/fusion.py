@@ -30,7 +30,7 @@ from imu_fusion.estimation.orientation.measurements import (
     rest,
 )
 from imu_fusion.estimation.orientation.motion_scale import motion_scale
-from imu_fusion.estimation.orientation.rest_detection import is_still
+from imu_fusion.estimation.orientation.rest_detection import is_still, refuted_turn
 from imu_fusion.estimation.orientation.rows import (
     FLAG_ALIGNING,
     FLAG_GAP,
@@ -45,7 +45,13 @@ from imu_fusion.estimation.orientation.rows import (
     write_attitude,
 )
 from imu_fusion.estimation.orientation.state import MAG_SUM
-from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
+from imu_fusion.geometry.rotation import (
+    quat_exp,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    quat_to_matrix,
+)
 from imu_fusion.kernels import njit
 
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
@@ -121,6 +127,10 @@ def step(s, p, stamp, sample, row, tape):
     s.step.still = is_still(s, p)
     if s.step.still:
         s.step.flags |= FLAG_STILL
+    elif s.rest.settled:
+        turned = refuted_turn(s, p)
+        if turned > 0.0:
+            _realign(s, p, turned)
     result = 1
     length = p.fusion.block * (_BURST_SHARE if s.clipped else 1.0)
     if s.step.back or s.block.time >= length - 1e-6:
@@ -147,7 +157,7 @@ def _begin_step(s, p, stamp, sample):
             s.gyr_last[i] = step.gyr[i]
             s.force_last[i] = s.rest.mean_force[i] = step.acc[i]
     if first:
-        s.rest.since = s.stamp = stamp
+        s.rest.since = s.rest.changed = s.stamp = stamp
         s.started = True
     step.dt = (stamp - s.stamp) * 1e-9
     s.stamp = stamp
@@ -234,14 +244,42 @@ def _collect(s, p, middle):
 
 @njit
 def _allow_for_gap(s, p):
-    """Nothing is known of the motion in a gap: start velocity and position anew."""
+    """Nothing is known of the motion in a gap."""
     s.step.flags |= FLAG_GAP
     s.counts.gaps += 1
-    s.rest.since = s.stamp
+    s.rest.since = s.rest.changed = s.stamp
+    s.rest.settled = 0
     unseen = min((p.gap.rate_sd * s.step.dt) ** 2, es.UNIFORM_VARIANCE)
+    for i in range(3):
+        s.block.noise[es.ATTITUDE + i] += unseen
+    _forget_motion(s, p)
+
+
+@njit
+def _realign(s, p, turned):
+    """A rest has refuted bias and attitude: what is known of them, and of what they were thought to
+    show, begins anew. turned: rad, what the bias has turned the attitude by in this rest alone."""
+    s.counts.realigned += 1
+    rest, noise = s.rest, s.block.noise
+    force = rest.mean_force
+    up = quat_rotate(s.quat_world_imu, (force[0], force[1], force[2]))
+    unsure = (up[0] ** 2 + up[1] ** 2) / (up[0] ** 2 + up[1] ** 2 + up[2] ** 2) + turned ** 2
+    for i in range(3):
+        noise[es.ATTITUDE + i] += unsure
+        noise[es.GYRO_BIAS + i] += (rest.mean_rate[i] - s.gyro_bias[i]) ** 2
+        noise[es.ACC_BIAS + i] += p.sensor.acc_bias_sd ** 2
+        for j in range(3):
+            noise[es.GYRO_SCALE + 3 * i + j] += p.sensor.gyro_scale_sd ** 2
+    _forget_motion(s, p)
+    rest.changed = s.stamp
+    rest.settled = 0
+
+
+@njit
+def _forget_motion(s, p):
+    """Start velocity and position anew."""
     noise = s.block.noise
     for i in range(3):
-        noise[es.ATTITUDE + i] += unseen
         noise[es.VELOCITY + i] += p.fusion.velocity_sd ** 2
         noise[es.POSITION + i] += p.fusion.position_sd ** 2
         s.velocity[i] = 0.0
@@ -282,11 +320,11 @@ def _end_block(s, p, tape):
     # A plain array: the algebra is compiled once for all that it is used on.
     es.predict(s.cov[:], s.block)
     error = np.zeros(es.N)
-    known = s.log_likelihood
+    known, placed = s.log_likelihood, s.position_likelihood
     correct(s, p, error, tape)
     if s.clipped or s.was_clipped:
         # What a clipped rate was is a guess: its misfit is no evidence of the surroundings.
-        s.log_likelihood = known
+        s.log_likelihood, s.position_likelihood = known, placed
     _add_error(s, p, error)
     magnetometer.judge_anchor(s, p)
     if len(tape):
@@ -320,10 +358,10 @@ def _finish_prediction(s, p):
         lasting = ((s.clipped & s.was_clipped) >> i) & 1
         block.stays_clipped[i] = lasting
         noise[es.ATTITUDE + i] += p.sensor.gyro_noise_density ** 2 * time
-        noise[es.GYRO_BIAS + i] = p.sensor.gyro_bias_walk ** 2 * time
-        noise[es.VELOCITY + i] = f.velocity_walk ** 2 * time
+        noise[es.GYRO_BIAS + i] += p.sensor.gyro_bias_walk ** 2 * time
+        noise[es.VELOCITY + i] += f.velocity_walk ** 2 * time
         noise[es.FIELD + i] = f.field_walk ** 2 * time
-        noise[es.ACC_BIAS + i] = lasting_var
+        noise[es.ACC_BIAS + i] += lasting_var
         s.acc_bias[i] *= block.acc_bias_keep
         noise[es.LOCAL_FIELD + i] = p.local_field_sd ** 2 * (1.0 - keep * keep)
         if lasting:
@@ -366,7 +404,7 @@ def correct(s, p, error, tape):
                 s.wander.velocity[i] = wander.low_passed(s.wander.velocity[i], innovation,
                                                          s.block.time)
             bounded_motion.position(i, s, p, scale, rows[0])
-            s.log_likelihood += es.update(s.cov, error, states, rows[0], tape)[1]
+            s.position_likelihood += es.update(s.cov, error, states, rows[0], tape)[1]
     s.wander.since += s.block.time
     if s.mag_sum.count > 0:
         magnetometer.field(s, p, error, rows)
@@ -443,7 +481,7 @@ def _write(s, p, row, taped):
         row.cov_acc[i, i] = var_acc
         row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
-    wander.widen(cov_world, s.wander.recent)
+    wander.widen(cov_world, wander.shown(s.wander))
     cov_world[2, 2] += s.heading_var
     if not taped:    # else the smoother does it, after its correction
         raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)

@@ -11,11 +11,10 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.parameters.record import record
 from imu_fusion.sensors.params import sensor
 
-# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope is
-# given up where the samples are a thousand times likelier without it, that accelerations come and
-# go where they are a million times: poor gyroscopes gain likelihood that way, too.
-_LOG_ODDS_IRON, _LOG_ODDS_POOR = math.log(0.1), math.log(0.001)
-_LOG_ODDS_LASTING = math.log(1e-6)
+# Before there is a sample: one recording in ten is near iron; what is stated of the gyroscope, or
+# that accelerations come and go, is given up where the samples are a thousand times likelier
+# without it.
+_LOG_ODDS_IRON, _LOG_ODDS_GIVEN_UP = math.log(0.1), math.log(0.001)
 # Vehicles vibrate: by how much the gyroscope is noisier where accelerations last (a car: 3e-3).
 _VIBRATION = 10.0
 # Rotation from ENU to the world frame that is published, xyzw.
@@ -333,9 +332,9 @@ def kernel_parameters(params: OrientationParams) -> np.ndarray:
 def _hypothesis(params: OrientationParams, local_field_sd: float, gyro_factor: float,
                 lasting_acc_sd: float, without_field: int) -> np.ndarray:
     s, f = params.sensor, params.fusion
-    log_prior = (_LOG_ODDS_LASTING if lasting_acc_sd > 0.0 else
+    log_prior = (_LOG_ODDS_GIVEN_UP if lasting_acc_sd > 0.0 else
                  _LOG_ODDS_IRON * (local_field_sd != f.local_field_sd[0])
-                 + _LOG_ODDS_POOR * (gyro_factor != f.gyro_factor[0]))
+                 + _LOG_ODDS_GIVEN_UP * (gyro_factor != f.gyro_factor[0]))
     noise = _VIBRATION if lasting_acc_sd > 0.0 else 1.0
     params = replace(params, sensor=replace(
         s, gyro_noise_density=noise * s.gyro_noise_density,

@@ -14,6 +14,8 @@ from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.saturation import BAND
 from imu_fusion.sensors.unmixing import unmix
 
+_WILD = 1.1    # limits: nothing that was clipped lies beyond, whatever a calibration mixes
+
 
 def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLog:
     """The log with recovered rates and their standard deviation ``gyr_sd``.
@@ -43,12 +45,12 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLo
               else np.broadcast_to(params.sensor.gyro_range, 3))
     tops = unmix(imu.gyr, limits, BAND)
     mixing = tops.matrix - np.eye(3)
-    rows, used = _fused(imu, mag, imu.gyr, tops.clipped, params)
+    rows, used = _fused(imu, mag, imu.gyr, tops.clipped, limits, params)
     if tops.known.any():
         beyond = np.where(tops.clipped[used], rows["gyr"] - tops.seen[used], 0.0)
         mixed = imu.gyr.copy()
         mixed[used] += beyond @ mixing.T
-        rows, used = _fused(imu, mag, mixed, tops.clipped, params)
+        rows, used = _fused(imu, mag, mixed, tops.clipped, limits, params)
     missing = tops.clipped[used]
     recovered = np.where(missing, _in_bursts(rows, missing, params.fusion.angular_acc_time), 0.0)
     mixed_in = recovered @ np.abs(mixing).T
@@ -57,11 +59,12 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLo
     return ImuLog(rows["stamp"], rows["gyr"], rows["acc"], imu.frame_id, sd)
 
 
-def _fused(imu, mag, gyr, clipped, params):
+def _fused(imu, mag, gyr, clipped, limits, params):
     """Rows of the smoothed filter of rates (n, 3) that are ``clipped`` (n, 3), and the indices of
     the samples that they are of."""
-    # Flat tops that nothing else reaches: that is how the filter knows them.
-    top = 1.011 * np.abs(gyr).max(axis=0, initial=0.0) + 1e-3
+    # Flat tops that nothing else reaches, but for wild values: that is how the filter knows them.
+    size = np.abs(gyr)
+    top = 1.011 * np.where(size < _WILD * limits, size, 0.0).max(axis=0, initial=0.0) + 1e-3
     flat = np.where(clipped, np.copysign(top, gyr), gyr)
     estimator = OrientationEstimator(params.replace(
         **{"mode": "smoothed", "sensor.gyro_range": tuple(float(v) for v in top)}))

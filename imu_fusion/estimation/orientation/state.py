@@ -41,6 +41,12 @@ REST = np.dtype([
     ("mean_rate", "f8", 3),              # low-passed, raw
     ("mean_force", "f8", 3),             # low-passed, raw
     ("since", "i8"),                     # stamp of the last sign of motion
+    ("changed", "i8"),                   # stamp of the last change of rate or force
+    ("settled", "i8"),                   # stamp from which on neither has, and the mean rate is
+                                         # no bias; 0 where it is otherwise
+    ("settled_force", "f8", 3),          # mean_force at that stamp
+    ("settled_rate", "f8", 3),           # mean_rate, likewise
+    ("turn", "f8", 3),                   # rad, that the rates less their bias make since then
 ], align=True)
 """The rest detector (rest_detection)."""
 
@@ -88,11 +94,11 @@ STEP = np.dtype([
 """What the newest Imu sample brought: between the parts of one step of the fusion filter."""
 
 COUNT_NAMES = ("imu_used", "imu_rejected", "mag_used", "mag_rejected", "mag_late", "mag_disturbed",
-               "mag_saturated", "gaps", "saturated", "rates_held", "forces_held")
+               "mag_saturated", "gaps", "saturated", "rates_held", "forces_held", "realigned")
 COUNTS = np.dtype([(name, "i8") for name in COUNT_NAMES], align=True)
 """What became of the samples: used; refused as impossible, out of order or too many; too late;
 disturbed; with an axis at its limit; steps with a gap; Imu samples at a limit; rates and forces
-held."""
+held; rests that refuted bias and attitude."""
 
 EQUATION = np.dtype([
     ("rate", "f8", 3), ("rate_next", "f8", 3),   # rad/s at both ends, each in its own imu axes
@@ -155,7 +161,8 @@ STATE = np.dtype([
     ("cov", "f8", (N, N)),               # of the error state, at the end of the last block
     ("field_norm", "f8"),                # T; 0 before the first sample
     ("gravity", "f8"),                   # m/s^2
-    ("log_likelihood", "f8"),            # of all measurements so far, less a constant
+    ("log_likelihood", "f8"),            # of the measurements so far but positions, less a constant
+    ("position_likelihood", "f8"),       # of positions, likewise
     ("is_anchored", "?"),                # whether the heading is that of the first needle
     ("anchor", "f8", 12),                # rad, of that per hard (3) and soft iron (9)
     ("field_scatter", "f8"),             # mean square per axis about ``field`` while moving

@@ -14,6 +14,7 @@ from imu_fusion.kernels import njit
 
 _TIME = 5.0            # s, of the low-pass: slower than the motion, faster than the tilt forgets
 _MEMORY = 10.0         # s, over which its square is judged
+_PRIOR = 2.0           # s, that white innovations count for before there are any
 TILT, HEADING = 0, 1   # of the mean squares
 # Powers of the mean square by which standard deviations grow: 0.5 where innovations keep all of an
 # error. Tilt is followed fast, heading slowly. Chosen on the phones of benchmarks/orientation_sets.
@@ -30,15 +31,31 @@ def low_passed(value, innovation, time):
 @njit
 def judge(wander, time):
     """Mean squares after a block of ``time`` s, whose innovations are in."""
+    if time == 0.0:
+        return
+    if wander.time == 0.0:
+        wander.recent[:] = 1.0
+        wander.overall[:] = 1.0
     wander.time += time
+    # A low-pass that has just begun at zero shows less than it will.
+    settled = 1.0 - math.exp(-2.0 * wander.time / _TIME)
+    begun = wander.time + _PRIOR
     for kind in range(2):
         if kind == TILT:
             square = 0.5 * (wander.velocity[0] ** 2 + wander.velocity[1] ** 2)
         else:
             square = wander.field ** 2
-        begun = max(wander.time, _TIME)
-        wander.overall[kind] += time / begun * (square - wander.overall[kind])
-        wander.recent[kind] += time / min(begun, _MEMORY) * (square - wander.recent[kind])
+        excess = square / settled
+        wander.overall[kind] += time / begun * (excess - wander.overall[kind])
+        wander.recent[kind] += time / min(begun, _MEMORY) * (excess - wander.recent[kind])
+
+
+@njit
+def shown(wander):
+    """Mean squares by which live estimates are widened: what innovations do now, and at least what
+    they have done so far, which can come back at any time."""
+    return (max(wander.recent[TILT], wander.overall[TILT]),
+            max(wander.recent[HEADING], wander.overall[HEADING]))
 
 
 @njit

@@ -11,6 +11,7 @@ from imu_fusion.estimation.orientation import bank
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.samples.logs import MagLog
+from imu_fusion.simulation.going_round import Circles
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 from test.estimation.orientation.test_estimator import NOISY, feed, make
 from test.estimation.orientation.test_fusion import local_errors, rmse_deg, tilt_errors_deg
@@ -35,37 +36,11 @@ def beside_iron():
     return recording(0.15)
 
 
-class _Laps:
-    """At rest for 3 s, then circles of 2 m at 2 m/s, level and with a little swaying."""
-
-    radius, rate, sway = 2.0, 1.0, 0.05
-
-    def _angle(self, t):
-        moving = np.maximum(t - 3.0, 0.0)
-        return self.rate * (moving + np.expm1(-moving))    # fades in within a second or two
-
-    def _attitude(self, t):
-        swaying = self.sway * np.sin(6.0 * t) * (t > 3.0) * (1.0 - np.exp(3.0 - t)) ** 3
-        return (Rotation.from_rotvec(self._angle(t)[:, None] * [0.0, 0.0, 1.0])
-                * Rotation.from_rotvec(swaying[:, None] * [0.8, 0.6, 0.0]))
-
-    def truth(self, t):
-        t, h = np.asarray(t), 1e-3
-        angle = self._angle(t)
-        moving = np.maximum(t - 3.0, 0.0)
-        first, second = self.rate * -np.expm1(-moving), self.rate * np.exp(-moving) * (t > 3.0)
-        out = np.column_stack([np.sin(angle), -np.cos(angle), 0.0 * t])
-        along = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * t])
-        turn = (self._attitude(t - h).inv() * self._attitude(t + h)).as_rotvec() / (2.0 * h)
-        return (self._attitude(t).as_quat(), turn, self.radius * out,
-                self.radius * (second[:, None] * along - first[:, None] ** 2 * out))
-
-
 @pytest.fixture(scope="module")
 def laps():
     sensors = Sensors(gyr_density=3e-4, acc_density=5e-3, gyr_bias=(0.01, -0.01, 0.005),
                       gyr_matrix=np.eye(3) + 0.004 * np.array([[1, 1, 1], [0, 1, -1], [1, 0, 1]]))
-    imu, _, truth, _ = simulate(_Laps(), 60.0, rate=50.0, sensors=sensors, seed=1)
+    imu, _, truth, _ = simulate(Circles(seed=1), 60.0, rate=50.0, sensors=sensors, seed=1)
     return imu, truth
 
 

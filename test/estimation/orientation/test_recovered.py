@@ -54,6 +54,15 @@ def test_what_is_recovered_and_what_is_measured_beside_it_state_their_errors(rol
     assert np.median(found.gyr_sd[beyond]) < 20.0
 
 
+def test_a_wild_value_is_no_limit(rolling):
+    imu, mag, true = rolling
+    gyr = imu.gyr.copy()
+    gyr[700, 1] = 900.0
+    found = recover(ImuLog(imu.stamp, gyr, imu.acc), mag, OrientationParams().replace(**{
+        "fusion.use_acc": False, "sensor.gyro_range": (RANGE,)}))
+    assert np.abs(found.gyr - true)[:690].max() < 3.0
+
+
 def test_an_axis_that_stops_where_the_others_do_is_clipped_too():
     """x and y show flat tops; z wobbles below the same level and never passes it."""
     time = np.arange(3000) / RATE

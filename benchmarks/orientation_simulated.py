@@ -1,0 +1,138 @@
+"""Orientation on simulated motions that no set at hand has: python -m benchmarks.orientation_simulated
+
+    python -m benchmarks.orientation_simulated [--trials] [CASE ...]
+
+What is decided by physics or simulation, and not on the recordings of ``orientation_sets``, is
+decided here: which hypotheses there are, their prior odds, and what widens the covariance. Sensors
+are a phone's, but for what a case says; the truth is exact.
+"""
+
+import math
+import sys
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.orientation_sets import HEADER, Recording, peers, score_ours, summary, trial_line
+from benchmarks.table import write_table
+from imu_fusion.samples.logs import MagLog
+from imu_fusion.simulation.going_round import Circles, Walk, waves
+from imu_fusion.simulation.rotation import Motion, Sensors, Tumbling, earth_field, simulate
+
+SEEDS = range(4)
+_RATE, _REST, _CUT = 100.0, 3.0, 10.0   # Hz; s of rest; s cut off where the start is in motion
+_NORM = 48e-6                           # T
+_TURNED_OFF = {"fusion.lasting_acc_sd": 0.0}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of recordings: a motion for each seed, and what is off.
+
+    place: standard deviation per axis of the field of places, 1 m apart, relative to its norm;
+    current: the same of a magnet that comes and goes with a current, in imu axes; bias: of the
+    gyroscope, rad/s, scale: of each of its axes; cut: start in motion.
+    """
+
+    motion: object
+    magnetometer: bool = True
+    place: float = 0.0
+    current: float = 0.0
+    bias: float = 0.01
+    scale: float = 0.0
+    cut: bool = False
+    duration: float = 63.0
+
+
+def _tumbling(seed):
+    return Tumbling(seed=seed, rate_sd=1.5, rest=_REST)
+
+
+def _circles(leans, seed):
+    rng = np.random.default_rng(seed)
+    rate = rng.uniform(0.4, 1.2)
+    return Circles(seed, min(rng.uniform(1.5, 5.0), 3.5 / rate ** 2),
+                   rate * rng.choice([-1.0, 1.0]), leans)
+
+
+_scooter, _cart = partial(_circles, True), partial(_circles, False)
+
+CASES = {
+    "hand": Case(_tumbling),
+    "hand, no magnetometer": Case(_tumbling, magnetometer=False),
+    "hand, start in motion": Case(_tumbling, cut=True),
+    "hand in a building": Case(_tumbling, place=0.1),
+    "hand in a building, start in motion": Case(_tumbling, place=0.1, cut=True),
+    "walker's laps in a building": Case(Walk, place=0.1),
+    "walker's laps in a building, start in motion": Case(Walk, place=0.1, cut=True),
+    "walker's laps, start in motion, no magnetometer": Case(Walk, magnetometer=False, cut=True),
+    "leaning circles, no magnetometer": Case(_scooter, magnetometer=False, duration=90.0),
+    "leaning circles": Case(_scooter, duration=90.0),
+    "level circles, no magnetometer": Case(_cart, magnetometer=False, duration=90.0),
+    "level circles, start in motion, no magnetometer": Case(_cart, magnetometer=False, cut=True,
+                                                            duration=90.0),
+    "magnet that comes with a current": Case(_tumbling, current=0.15),
+    "gyroscope's scale off by 4 to 8 %, no magnetometer": Case(_tumbling, magnetometer=False,
+                                                               scale=0.06),
+    "bias of 3 deg/s per axis, start in motion": Case(_tumbling, bias=0.05, cut=True),
+}
+
+
+def _building(seed):
+    """Field of places (n, 3) at positions (n, 3) m, relative to ``Case.place``."""
+    rng = np.random.default_rng(seed)
+    k, phase = rng.normal(0, 1.0, (24, 3)), rng.uniform(0, 2 * math.pi, (24, 3))
+    size = rng.normal(0, math.sqrt(2 / 24), (24, 3))
+    return lambda place: (size * np.sin((place @ k.T)[:, :, None] + phase)).sum(axis=1)
+
+
+def record(name, case, seed):
+    """Recording of a case."""
+    rng = np.random.default_rng(1000 + seed)
+    matrix = np.eye(3) + rng.normal(0, 0.005, (3, 3)) + np.diag(
+        case.scale * rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3))
+    sensors = Sensors(
+        gyr_density=3e-4, acc_density=2e-3, mag_sd=4e-7, gyr_walk=2e-5, gyr_matrix=matrix,
+        gyr_bias=tuple(rng.normal(0, case.bias, 3)), acc_bias=tuple(rng.normal(0, 0.03, 3)),
+        mag_offset=tuple(rng.normal(0, 5e-7, 3)))
+    motion: Motion = case.motion(seed)
+    imu, mag, truth, _ = simulate(motion, case.duration, rate=_RATE, sensors=sensors, seed=seed,
+                                  field_world=earth_field(_NORM, math.radians(65)))
+    time = mag.stamp * 1e-9
+    quat, _, place, _ = motion.truth(time)
+    added = (case.place * Rotation.from_quat(quat).inv().apply(_building(seed)(place))
+             + case.current * np.tanh(5.0 * waves(seed, 0.02, 0.2)(time)) * (time > _REST)[:, None])
+    mag = MagLog(mag.stamp, mag.mag + _NORM * added)
+    first = int((_CUT if case.cut else 0.0) * _RATE)
+    counts = imu.stamp[first:] > (0.0 if case.cut else _REST * 1e9)
+    return Recording(f"{name} {seed}", imu[first:], mag[first:] if case.magnetometer else None,
+                     np.asarray(truth.quat_world_imu)[first:], counts,
+                     "" if case.magnetometer else "yaw")
+
+
+def main(arguments):
+    trials = "--trials" in arguments
+    chosen = [a for a in arguments if not a.startswith("--")] or list(CASES)
+    rows = []
+    for name in chosen:
+        scores, without = [], []
+        for seed in SEEDS:
+            r = record(name, CASES[name], seed)
+            scores.append(peers(r) | score_ours(r))
+            without.append(scores[-1] | score_ours(r, _TURNED_OFF))
+            if trials:
+                print(trial_line(r.name, scores[-1]), flush=True)
+        for row, other in zip(summary(name, scores), summary(name, without)):
+            rows.append([*row, f"{other[4]} ({other[6]})"])
+            print(" | ".join(rows[-1]), flush=True)
+    if chosen == list(CASES):
+        write_table("orientation_simulated", [*HEADER, "ours without lasting accelerations"], rows,
+                    note=f"Peers and columns as in orientation_sets, vqf {version('vqf')}; "
+                         f"{len(SEEDS)} seeds each. In brackets: share within 3 sigma.")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
