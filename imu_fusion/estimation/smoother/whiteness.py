@@ -53,7 +53,7 @@ def correlation(innovations: np.ndarray) -> float:
 
     It does not depend on what is stated: a receiver that states metres, is better in each fix, and
     errs the same way for a minute, leaves innovations that are small, and a trajectory that is
-    surer than its fixes allow.
+    surer than its fixes allow. Those that are smaller than the mean of all is sure do no harm.
 
     Args:
         innovations: (n, k), normalised.
@@ -62,7 +62,7 @@ def correlation(innovations: np.ndarray) -> float:
     cut = np.clip(innovations, -_LARGEST, _LARGEST)
     products = np.sum(cut[1:] * cut[:-1], axis=0)
     squares = np.sum(cut ** 2, axis=0)
-    largest = float(np.max(products / np.maximum(squares, np.finfo(float).tiny), initial=0.0))
+    largest = float(np.max(products / np.maximum(squares, 1.0), initial=0.0, where=squares > 1.0))
     by_chance = scipy.stats.norm.isf(_CHANCE) / np.sqrt(max(n, 1))
     return largest if largest > max(_CORRELATED, by_chance) else 0.0
 

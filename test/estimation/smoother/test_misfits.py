@@ -141,7 +141,8 @@ def test_correlation_does_not_depend_on_what_is_stated():
     assert np.count_nonzero(white) < 4    # a thousandth of 600 components
     slow = gauss_markov((150, 3), 1.0, 10.0, 1.0, rng)
     assert correlation(slow) == pytest.approx(np.exp(-0.1), abs=0.15)
-    assert correlation(0.1 * slow) == pytest.approx(correlation(slow))
+    assert correlation(0.3 * slow) == pytest.approx(correlation(slow))
+    assert correlation(0.01 * slow) == 0.0    # less than the mean of 150 is sure: .08
 
 
 def test_errors_of_a_minute_show_in_means_over_longer_times():
