@@ -65,7 +65,7 @@ def main(role, count):
             time.sleep(NAP)
     for p in outs:
         p.wait_for_all_acked(Duration(seconds=60))
-    node.destroy_node()    # as our nodes: left to Python, after the context, one was seen to spin
+    node.destroy_node()
     rclpy.try_shutdown()
 
 
