@@ -13,8 +13,8 @@ from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.samples.logs import MagLog
 from imu_fusion.simulation.going_round import Circles
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
+from test.estimation.orientation.errors import local_errors, rmse_deg, tilt_errors_deg
 from test.estimation.orientation.test_estimator import NOISY, feed, make
-from test.estimation.orientation.test_fusion import local_errors, rmse_deg, tilt_errors_deg
 
 
 def recording(local_sd, seed=4, duration=30.0):

@@ -9,8 +9,8 @@ from imu_fusion.estimation.orientation.rows import FLAG_STILL
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.simulation.going_round import Circles
 from imu_fusion.simulation.rotation import GRAVITY, Sensors, Tumbling, simulate
+from test.estimation.orientation.errors import local_errors, tilt_errors_deg
 from test.estimation.orientation.test_estimator import feed, make
-from test.estimation.orientation.test_fusion import local_errors, tilt_errors_deg
 
 LENGTH = 30.0
 BIAS = np.array([0.12, -0.05, 0.03])

@@ -8,8 +8,8 @@ from imu_fusion.estimation.orientation import wander
 from imu_fusion.estimation.orientation.state import WANDER
 from imu_fusion.kernels import njit
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from test.estimation.orientation.errors import local_errors, tilt_errors_deg
 from test.estimation.orientation.test_estimator import make
-from test.estimation.orientation.test_fusion import local_errors, tilt_errors_deg
 
 MODES = ("causal", "smoothed")
 
