@@ -2,6 +2,7 @@
 
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation.rows import FLAG_GAP
+from imu_fusion.estimation.orientation.state import MOST_REFUTING
 from imu_fusion.geometry.rotation import quat_rotate
 from imu_fusion.kernels import njit
 
@@ -25,6 +26,10 @@ def realign(s, p, turned):
     show, begins anew. turned: rad, what the bias has turned the attitude by in this rest alone."""
     s.counts.realigned += 1
     rest, noise = s.rest, s.block.noise
+    for n in range(MOST_REFUTING):
+        if rest.refuting[n] == 0 or rest.refuting[n] == rest.settled:
+            rest.refuting[n] = rest.settled
+            break
     force = rest.mean_force
     up = quat_rotate(s.quat_world_imu, (force[0], force[1], force[2]))
     unsure = (up[0] ** 2 + up[1] ** 2) / (up[0] ** 2 + up[1] ** 2 + up[2] ** 2) + turned ** 2

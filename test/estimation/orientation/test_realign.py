@@ -104,3 +104,13 @@ def test_a_body_that_feels_no_force_refutes_nothing():
     estimator = make({})
     assert len(estimator.run(imu)) == n
     assert estimator.summary()["realigned"] == 0
+
+
+def test_the_smoother_knows_a_rest_from_its_beginning(coming_to_rest):
+    """Live it takes seconds of it to tell that the bias was wrong."""
+    imu, _, truth, _ = coming_to_rest
+    begun = (imu.stamp > int((LENGTH - 6.0) * 1e9)) & (imu.stamp < int((LENGTH - 5.5) * 1e9))
+    changes = {"fusion.gyro_factor": 1.0, "fusion.lasting_acc_sd": 0.0}
+    tilt = {mode: tilt_errors_deg(make({"mode": mode, **changes}).run(imu), truth)[begun]
+            for mode in ("causal", "smoothed")}
+    assert tilt["causal"].min() > 5.0 and tilt["smoothed"].max() < 2.0
