@@ -300,7 +300,7 @@ def six_uniaxial(seed):
 
 FIELD_ROWS = [
     field_row("clean, mounting known exactly (sd 0)", "", felt,
-              {"position_sd": 0.0, "axes_sd": 0.0}),
+              {"position_sd": 0.0, "axes_sd": 0.0, "scale_sd": 0.0}),
     field_row("clean, defaults", "", felt),
     field_row("clean, defaults, smoothed", "", felt, mode="smoothed"),
     field_row("positions off by 1 mm", "NEES 4,600", lambda rng: felt(rng, position_sd=1e-3)),

@@ -98,11 +98,11 @@ class AccelerationFieldEstimator:
     def remarks(self) -> list[str]:
         """What is wrong with the sensors, and what to do, by the samples so far."""
         found = []
-        mounting = self.array.felt[["position_sd", "axes_sd"]].tolist()
+        mounting = self.array.felt[["position_sd", "axes_sd", "scale_sd"]].tolist()
         if self.params.method != "rigid_body" and np.any(mounting):
-            found.append(f"method '{self.params.method}' takes positions and axes as exact: what "
-                         "it states leaves their errors out; use rigid_body, or say that they are "
-                         "(position_sd and axes_sd 0)")
+            found.append(f"method '{self.params.method}' takes positions, axes and scales as "
+                         "exact: what it states leaves their errors out; use rigid_body, or say "
+                         "that they are (position_sd, axes_sd and scale_sd 0)")
         if self._judged is not None:
             found += fit_remarks(self.sensor_fits(), self.array, self._judged)
         found += coarse_remarks(self.names, self.array, self.params, self._limits.steps)

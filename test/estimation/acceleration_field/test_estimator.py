@@ -26,12 +26,13 @@ from imu_fusion.simulation.rigid_body_impact import (
 GIVEN = AccelerationFieldParams(
     initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=1e-6),
     gravity=9.8)
+EXACT = {"position_sd": 0.0, "axes_sd": 0.0, "scale_sd": 0.0}
 METHODS = [{"method": "ao"}, {"method": "sqrt_ao"}, {"method": "rigid_body"},
            {"method": "rigid_body", "mode": "smoothed"}]
 
 
 def sensors(positions=PAPER_POSITIONS, axes=PAPER_AXES, **common):
-    common = {"noise_density": 1e-6, "bias_sd": 0.0, "position_sd": 0.0, "axes_sd": 0.0, **common}
+    common = {"noise_density": 1e-6, "bias_sd": 0.0, **EXACT, **common}
     return [AccelerometerParams(position=tuple(p), axes=tuple(np.ravel(a)), **common)
             for p, a in zip(positions, axes)]
 
@@ -101,7 +102,7 @@ def test_gradient_worked_by_hand():
 def _some_axes(positions, measured, axes=None):
     axes = [np.eye(3)] * len(positions) if axes is None else axes
     return [AccelerometerParams(position=tuple(p), axes=tuple(np.ravel(a)), measured_axes=m,
-                                noise_density=1e-6, bias_sd=0.0, position_sd=0.0, axes_sd=0.0)
+                                noise_density=1e-6, bias_sd=0.0, **EXACT)
             for p, m, a in zip(positions, measured, axes)]
 
 
@@ -124,7 +125,7 @@ def _layouts():
         "six bi-axial": _some_axes(spread[:6], [("x", "y"), ("y", "z"), ("x", "z")] * 2, turned),
         "twelve uni-axial": _some_axes(spread, [("x",)] * 12, turned),
         "nine-accelerometer package": _nine_accelerometer_package(
-            0.1, noise_density=1e-6, bias_sd=0.0, position_sd=0.0, axes_sd=0.0),
+            0.1, noise_density=1e-6, bias_sd=0.0, **EXACT),
     }
 
 

@@ -273,7 +273,7 @@ def test_a_dead_sensor_does_not_spoil_the_start():
 
 
 def test_the_papers_method_says_what_it_leaves_out(impact):
-    exact = layout(position_sd=0.0, axes_sd=0.0)
+    exact = layout(position_sd=0.0, axes_sd=0.0, scale_sd=0.0)
     for accelerometers, said in ((layout(), True), (exact, False)):
         estimator = AccelerationFieldEstimator(PARAMS.replace(method="ao"), accelerometers)
         assert bool(estimator.remarks()) is said
