@@ -251,8 +251,9 @@ def update(state, p, channels, reading, at, work, trace, n, open_states):
     """Correct the State by the channels in use of one sample, in place.
 
     Args:
-        p: record of the parameters, channels: (m,) CHANNEL, reading: (m,), nan where there is none
-            and inf where it is saturated, at: (N,) the state that ``work`` is linearised at.
+        p: record of the parameters, channels: (m,) CHANNEL, reading: (m,), nan where there is none,
+            inf where it is saturated and -inf where it stands still, at: (N,) the state that
+            ``work`` is linearised at.
         work: Workspace, whose ``use`` says which channels are in use, and ``doubt`` what is added
             to the variance of their noise.
         trace: Trace that gets sample n.
@@ -288,6 +289,6 @@ def unused_flags(reading, use):
     """Why a channel is not used: MISSING, SATURATED, LEFT_OUT; 0 if it is."""
     if math.isnan(reading):
         return MISSING
-    if math.isinf(reading):
+    if reading == math.inf:
         return SATURATED
     return 0 if use else LEFT_OUT

@@ -59,8 +59,10 @@ class SensorFit:
                                 "axes_error_sd", "scale_error", "scale_error_sd")}}
 
 
-def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[SensorFit]:
-    """The SensorFits of an array after the samples that led to ``state``."""
+def sensor_fits(names: list[str], array: SensorArray, state: State,
+                standing: dict[int, str]) -> list[SensorFit]:
+    """The SensorFits of an array after the samples that led to ``state``; ``standing``: texts on
+    those that stand still, by their number."""
     found: list[SensorFit] = []
     for k, name in enumerate(names):
         own = array.channels[array.channels["sensor"] == k]
@@ -71,8 +73,8 @@ def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[Sens
         axes = own["column"] % 3
         scale[axes], scale_sd[axes] = _states(state, own["scale"])
         residual = np.sqrt(check["squares"] / check["channels"]) if check["channels"] else np.nan
-        fault = ""
-        if check["left_out"] >= _SAMPLES:
+        fault = standing.get(k, "")
+        if not fault and check["left_out"] >= _SAMPLES:
             fault = (f"accelerometer '{name}' contradicts the others in {check['left_out']} of "
                      f"{check['checked']} samples and was left out of them: "
                      f"{_cause(name, check, own)}")

@@ -300,6 +300,19 @@ def test_rest_finds_tilt_and_biases(motion):
     assert np.sqrt(variance[1:]) == pytest.approx([0.0102, 0.0102], rel=0.05)
 
 
+def test_strong_noise_does_not_hide_that_a_body_turns():
+    # 1.7 rad/s about a level axis, then still: noise of 2 m/s^2 is more than what that changes.
+    t = np.arange(800) / 62.5
+    angle = 1.7 * np.minimum(t, 6.0)
+    felt = 9.80665 * np.column_stack([0.0 * t, np.sin(angle), np.cos(angle)])
+    readings = np.einsum("kij,nj->nki", PAPER_AXES, felt)
+    readings += np.random.default_rng(0).normal(0.0, 2.0, readings.shape)
+    params = AccelerationFieldParams(sample_rate=62.5, initial=Initial(duration=2.0))
+    rows = AccelerationFieldEstimator(params, sensors(noise_density=2.0 / 62.5 ** 0.5)).run(
+        np.round(t * 1e9).astype(np.int64), readings)
+    assert 5.0 < rows["stamp"][0] * 1e-9 < 7.0
+
+
 def test_rest_waits_until_the_body_is_still(motion):
     readings = np.tile(np.einsum("kij,j->ki", PAPER_AXES, [0, 0, 9.80665]), (1000, 1, 1))
     readings[:300] += 5 * np.sin(np.arange(300) / 9)[:, None, None]
