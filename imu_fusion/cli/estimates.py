@@ -188,7 +188,7 @@ def radar(bag: str, place: tuple[float, float, float], gates: str | None, gate_l
     """
     from imu_fusion.recordings.targets import refuse_files
     from imu_fusion.report.radar import write_radar_report
-    refuse_files([bag, gates], out)
+    refuse_files([bag, gates, surface], out)
     table = Table("trajectory and radar", "")
     for row in write_radar_report(bag, place, out, gates, gate_length, along_beam,
                                   surface):

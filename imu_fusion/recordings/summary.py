@@ -8,6 +8,7 @@ from typing import Any
 
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.results import read_results
+from imu_fusion.recordings.targets import whole_file
 
 SUMMARY_FILE = "summary.csv"
 
@@ -44,14 +45,12 @@ def write_summary(folder: Path, names: Iterable[str]) -> Path:
     rows = [{"recording": name} | dict(_numbers(read_results(folder / name) or {}))
             for name in names]
     file = folder / SUMMARY_FILE
-    try:
+    with whole_file(file) as part:
         folder.mkdir(parents=True, exist_ok=True)
-        with open(file, "w", newline="") as stream:
+        with open(part, "w", newline="") as stream:
             writer = csv.DictWriter(stream, list(dict.fromkeys(key for row in rows for key in row)))
             writer.writeheader()
             writer.writerows(rows)
-    except OSError as error:
-        raise BagError(f"{file}: cannot be written ({error.strerror})") from None
     return file
 
 
