@@ -3,6 +3,7 @@
 import csv
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def _length(table, line, row):
     if not 0.0 < measured < math.inf:
         raise BagError(f"{table}, line {line}: measured is {row['measured']!r}, no length in m")
     recording = table.parent / (row["recording"] or "")
-    jump = results_of(recording, _NODE).get("jump")
+    jump: Any = results_of(recording, _NODE).get("jump")
     try:
         return float(jump["length"]), float(jump["length_sd"]), measured
     except (TypeError, KeyError, ValueError):

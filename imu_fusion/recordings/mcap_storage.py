@@ -192,9 +192,11 @@ class McapStorage(FileStorage):
         first, last, unpacked, crc, text = CHUNK_HEAD.unpack_from(head)
         compression = head[32:32 + text].decode("ascii", "replace")
         start = content + 40 + text
-        claimed = (first, last) if first <= last else (None, None)
-        self._blocks.append(_Block(start, end - start, unpacked, compression, crc, *claimed,
-                                   claimed=claimed))
+        block = _Block(start, end - start, unpacked, compression, crc)
+        if first <= last:
+            block.claimed = first, last
+        block.forget()
+        self._blocks.append(block)
 
     def _take_index(self, content: bytes) -> None:
         """How many messages of a channel the chunk before it holds, and when."""
