@@ -37,7 +37,7 @@ def _show_calibration(title, rows, remarks, text, out, lost):
         click.echo(text)
     else:
         from imu_fusion.recordings.targets import whole_file
-        with whole_file(out) as file:
+        with whole_file(out, text.partition(", ")[0]) as file:    # a calibration of the same
             file.write_text(text)
         click.echo(f"written: {out}")
     end(bool(lost))
@@ -98,7 +98,7 @@ def calibrate_noise(bag: str, topic: str, mag_topic: str, plot: str | None, out:
     found, remarks = noise.recorded_noise(bag, topic, mag_topic, lost.append)
     if plot is not None:
         from imu_fusion.recordings.targets import whole_file
-        with whole_file(plot) as file:
+        with whole_file(plot, "<") as file:
             noise.write_plot(found, file)
         click.echo(f"written: {plot}")
     _show_calibration("noise, x, y, z", [row for s in found for row in noise.noise_report(s)],

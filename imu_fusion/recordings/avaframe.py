@@ -75,8 +75,9 @@ def export_avaframe(path: str | Path, out: str | Path, crs: str | None = None,
     time = (stamp - stamp[0]) * 1e-9
     rows = np.unique(np.searchsorted(time, np.arange(0.0, time[-1] + 1e-9, interval)))
     table = particle_table(time[rows], position[rows], velocity[rows])
-    with whole_file(out) as file:
-        np.savetxt(file, table, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.6f")
+    header = ",".join(COLUMNS)
+    with whole_file(out, header) as file:
+        np.savetxt(file, table, delimiter=",", header=header, comments="", fmt="%.6f")
     return len(table)
 
 

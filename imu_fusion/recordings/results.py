@@ -8,10 +8,12 @@ from typing import Any
 
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.targets import RESULTS_FILE, whole_file
+from imu_fusion.samples.guard import Verdict
 
 LEFT_OUT, RECORDING = "left_out", "recording"    # what was not used, of the nodes and as a whole
 FINDINGS = "findings"    # texts on what looks wrong with the samples
 UNDECODABLE = "cannot be decoded"
+_BROKEN = {UNDECODABLE, Verdict.NEGATIVE.value, Verdict.WILD.value}
 
 
 def write_results(directory: str | Path, found: Mapping[str, Any]) -> None:
@@ -61,11 +63,12 @@ def left_out(refused: Mapping[str, Mapping], lost: Sequence[str]) -> dict[str, d
 
 
 def is_incomplete(directory: str | Path) -> bool:
-    """Whether messages of the recording were lost: damaged parts, messages that are broken. What
-    a sensor repeats or reports as absent is left out, too, but not lost."""
+    """Whether messages of the recording were lost: damaged parts, messages or stamps that are
+    broken. What a sensor repeats or reports as absent is left out, too, but not lost."""
     left_out = (read_results(directory) or {}).get(LEFT_OUT, {})
-    return RECORDING in left_out or any(
-        UNDECODABLE in reasons for topics in left_out.values() for reasons in topics.values())
+    return RECORDING in left_out or any(not _BROKEN.isdisjoint(reasons)
+                                        for topics in left_out.values()
+                                        for reasons in topics.values())
 
 
 def _plain(value):

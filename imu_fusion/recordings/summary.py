@@ -8,7 +8,7 @@ from typing import Any
 
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.results import read_results
-from imu_fusion.recordings.targets import whole_file
+from imu_fusion.recordings.targets import refuse_files, refuse_source, whole_file
 
 SUMMARY_FILE = "summary.csv"
 
@@ -27,6 +27,26 @@ def names_of(bags: Iterable[str | Path]) -> dict[str, str | Path]:
                            "to one place. Rename one, or process them one by one")
         names[name] = bag
     return names
+
+
+def refuse_sources(names: Mapping[str, str | Path], folder: Path, overwrite: bool) -> None:
+    """Refuse a folder for the estimates of recordings where one of them would go with what they
+    replace.
+
+    Args:
+        names: of :func:`names_of`. folder: theirs go to ``folder/NAME`` each. overwrite: whether a
+            table that is there may be replaced.
+
+    Raises:
+        BagError: names what is in the way.
+    """
+    for name in names:
+        for bag in names.values():
+            refuse_source(bag, folder / name)
+    refuse_files(names.values(), folder / SUMMARY_FILE)
+    if (folder / SUMMARY_FILE).exists() and not overwrite:
+        raise BagError(f"{folder / SUMMARY_FILE}: exists already; choose another folder or "
+                       "--overwrite")
 
 
 def write_summary(folder: Path, names: Iterable[str]) -> Path:
