@@ -14,10 +14,9 @@ from imu_fusion.evaluation.orientation_error import (
     statistics,
 )
 from imu_fusion.messages.convert import attitude_log
-from imu_fusion.messages.layouts import IMU
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
-from imu_fusion.recordings.logs import read_log, readable_messages
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.report.contents import moving_changes
 from imu_fusion.report.recording import write_recording_report
 
@@ -53,7 +52,7 @@ def _compare(played, recorded):
     Returns:
         (OrientationErrors, movement mask (n,) bool or None if the recording has none)
     """
-    estimates = attitude_log(readable_messages(recorded, "imu/data", IMU))
+    estimates = read_log(recorded, "imu/data", attitude_log)
     errors = orientation_errors(estimates.stamp, estimates.quat_world_imu,
                                 read_log(played, "reference/pose"), estimates.cov_attitude)
     changes = moving_changes(played)

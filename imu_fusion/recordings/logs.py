@@ -100,7 +100,7 @@ def _why_not(form: Callable[[bytes], object], cdr: bytes) -> str:
     return ""
 
 
-def read_log(reader: Reader, topic: str) -> Any:
+def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = None) -> Any:
     """The log of one topic of an open recording: which subclass of Log, its type decides.
 
     Messages that do not fit their type are left out; ``reader.warnings`` says so.
@@ -108,6 +108,8 @@ def read_log(reader: Reader, topic: str) -> Any:
     Args:
         reader: what :func:`imu_fusion.recordings.bag_reader.open_bag` returned.
         topic: name, with or without leading slash.
+        log_of: function of a list of messages, if not the one of its type
+            (such as :func:`imu_fusion.messages.convert.attitude_log`).
 
     Raises:
         TopicError: no such topic, or a type that has no log.
@@ -117,6 +119,8 @@ def read_log(reader: Reader, topic: str) -> Any:
     if kind is None:
         raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
                          f"logs exist for {', '.join(sorted(SAMPLE_TYPES))}")
+    if log_of is not None:
+        return log_of(readable_messages(reader, info.name, kind.layout))
     collector = LogCollector(kind)
     for *_, cdr in reader.messages([info.name]):
         collector.add(cdr)
