@@ -28,10 +28,9 @@ from test.sources.exports import (
     Server,
     batches,
     export,
-    read_parts,
     sensor_logger,
 )
-from test.sources.logs import read, together
+from test.sources.logs import read, read_parts, together
 from test.sources.test_splitting import escaped, nmea, solution
 
 TABLE = {"header": False, "time": {"column": "1", "unit": "us"},

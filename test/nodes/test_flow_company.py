@@ -77,8 +77,8 @@ def test_a_sink_that_lost_sight_of_its_sender_joins_it_anew(graph, monkeypatch):
     with monkeypatch.context() as blind:
         blind.setattr(receiver.flow.peers, "_writers", lambda topic: set())
         graph.until(lambda: receiver.ended)
-    graph.until(receiver.flow.sink.feeding)
-    sender.todo, sender.event = [102, 101, 100], END
+        graph.until(lambda: "no answer yet from /receiver" in sender.source.waiting_for())
+        sender.todo, sender.event = [102, 101, 100], END
     graph.until(lambda: len(receiver.ended) == 2 and sender.source.drained())
     assert receiver.values == list(range(103)) and receiver.input.missed == 100
     assert sender.flow.problems == ["/receiver has left in mid-session"]
