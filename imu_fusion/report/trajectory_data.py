@@ -13,6 +13,7 @@ from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.messages.layouts import IMU, ODOMETRY
 from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader
+from imu_fusion.recordings.logs import readable_messages
 from imu_fusion.streams.registry import STAGES
 from imu_fusion.streams.smoother_messages import (
     ODOMETRY_TOPIC,
@@ -32,19 +33,25 @@ def read_result(reader: Reader) -> tuple[SmootherResult | None, list[str], str]:
     names = [reader.find(topic) for topic in (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, RESULTS_TOPIC)]
     if None in names or not all(reader.topics[name].count for name in names if name):
         return None, [], f"{reader.path.name} holds no trajectory on {ODOMETRY_TOPIC}"
-    odometry, imu, results = ([cdr for *_, cdr in reader.messages([name])]
-                              for name in names if name)
-    found = results_value(results[-1])
+    odometry = readable_messages(reader, ODOMETRY_TOPIC, ODOMETRY)
+    imu = readable_messages(reader, SMOOTHED_IMU_TOPIC, IMU)
+    results = readable_messages(reader, RESULTS_TOPIC, results_value)
+    found = results_value(results[-1]) if results else {}
     if "origin" not in found:
         return None, [], (f"{reader.path.name} does not say where its trajectory begins; an older "
                           "imu_fusion has written it: process the recording again")
-    samples = samples_of(odometry, imu)
-    jump = JumpResult(**found["jump"]) if "jump" in found else None
-    return SmootherResult(
-        samples, LocalFrame(**found["origin"]), _states(found["states"], len(samples)), {},
-        (found["cost"],), found["iterations"], found["converged"], jump=jump,
-        events=None if jump is None else JumpEvents(jump.takeoff_stamp, jump.touchdown_stamp),
-        gnss_lag=found["gnss_lag"]), found["remarks"], ""
+    try:
+        samples = samples_of(odometry, imu)
+        if len(samples) == 0:
+            raise ValueError(f"no stamps that {ODOMETRY_TOPIC} and {SMOOTHED_IMU_TOPIC} share")
+        jump = JumpResult(**found["jump"]) if "jump" in found else None
+        return SmootherResult(
+            samples, LocalFrame(**found["origin"]), _states(found["states"], len(samples)), {},
+            (found["cost"],), found["iterations"], found["converged"], jump=jump,
+            events=None if jump is None else JumpEvents(jump.takeoff_stamp, jump.touchdown_stamp),
+            gnss_lag=found["gnss_lag"]), found["remarks"], ""
+    except (LookupError, TypeError, ValueError, AttributeError) as error:    # of somebody else
+        return None, [], f"{reader.path.name} holds a trajectory that cannot be read ({error!r})"
 
 
 def samples_of(odometry: list[bytes], imu: list[bytes]) -> np.ndarray:
