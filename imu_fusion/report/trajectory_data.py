@@ -30,10 +30,10 @@ def read_result(reader: Reader) -> tuple[SmootherResult | None, list[str], str]:
         not in a recording: NaN; nor are innovations: none.
     """
     names = [reader.find(topic) for topic in (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, RESULTS_TOPIC)]
-    if None in names or not all(reader.topics[name].count for name in names if name):
+    if not all(name and reader.topics[name].count for name in (names[0], names[2])):
         return None, [], f"{reader.path.name} holds no trajectory on {ODOMETRY_TOPIC}"
-    odometry, imu, results = ([cdr for *_, cdr in reader.messages([name])]
-                              for name in names if name)
+    odometry, imu, results = ([cdr for *_, cdr in reader.messages([name])] if name else []
+                              for name in names)
     found = results_value(results[-1])
     if "origin" not in found:
         return None, [], (f"{reader.path.name} does not say where its trajectory begins; an older "
@@ -44,19 +44,21 @@ def read_result(reader: Reader) -> tuple[SmootherResult | None, list[str], str]:
         samples, LocalFrame(**found["origin"]), _states(found["states"], len(samples)), {},
         (found["cost"],), found["iterations"], found["converged"], jump=jump,
         events=None if jump is None else JumpEvents(jump.takeoff_stamp, jump.touchdown_stamp),
-        gnss_lag=found["gnss_lag"]), found["remarks"], ""
+        gnss_lag=found["gnss_lag"], acc_density=found.get("acc_density")), found["remarks"], ""
 
 
 def samples_of(odometry: list[bytes], imu: list[bytes]) -> np.ndarray:
-    """Samples (SAMPLE) of messages on smoother/odometry and smoother/imu; what is not in them is
-    NaN.
+    """Samples (SAMPLE) of messages on smoother/odometry and smoother/imu (none: there was no Imu);
+    what is not in them is NaN.
 
     Undoes what :mod:`imu_fusion.streams.smoother` does to write them.
     """
     stamp, _, values = ODOMETRY.decode_many(odometry)
-    imu_stamp, _, forces = IMU.decode_many(imu)
-    stamp, own, of_imu = np.intersect1d(stamp, imu_stamp, return_indices=True)
-    values, forces = values[own], forces[of_imu]
+    forces = np.full((len(stamp), IMU.size), np.nan)
+    if imu:
+        imu_stamp, _, forces = IMU.decode_many(imu)
+        stamp, own, of_imu = np.intersect1d(stamp, imu_stamp, return_indices=True)
+        values, forces = values[own], forces[of_imu]
     rows = np.zeros(len(stamp), SAMPLE)
     for name in ("gyr_bias", "acc_bias", "gyr_bias_sd", "acc_bias_sd"):
         rows[name] = np.nan
@@ -70,7 +72,7 @@ def samples_of(odometry: list[bytes], imu: list[bytes]) -> np.ndarray:
     rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
     back = rotation.transpose(0, 2, 1)
     vel_imu = values[:, ODOMETRY["linear"]]
-    turned = np.cross(np.eye(3), vel_imu[:, None, :])
+    turned = np.cross(np.eye(3), vel_imu[:, None, :]) * bool(imu)
     rows["vel_world"] = np.einsum("nij,nj->ni", rotation, vel_imu)
     rows["cov_position"] = pose[:, :3, :3]
     rows["cov_attitude"] = back @ pose[:, 3:, 3:] @ rotation

@@ -21,6 +21,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.problem import Problem, log_density
+from imu_fusion.estimation.smoother.remarks import MOST_EXCESS
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.state import StatePrior
@@ -187,8 +188,12 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
                                              fit["innovation"][:, :width])
             residuals[measurement.name] = fit["residual"][:, :width]
     wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
-    widen(samples, wander)
-    fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
+    fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params,
+                        problem.free[problem.imu.recorded])
+    # A jump's landing makes its length less certain; other surfaces make all.
+    off = {c.name: fits[c.name].excess for c in problem.constraints
+           if c.phase == "always" and c.name in fits and fits[c.name].excess > MOST_EXCESS}
+    widen(samples, wander | off)
     jump, near, failure = None, 0.0, ""
     if hill is not None and solution.events is not None:
         near = near_ground(samples, states, solution.events, problem.constraints, problem.params)

@@ -13,6 +13,7 @@ from imu_fusion.estimation.smoother.attempt import Model
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.problem import NoiseFactors, Problem
 from imu_fusion.estimation.smoother.state import BLOCKS
+from imu_fusion.sensors.params import SENSOR
 
 _SENSOR = ("sensor.gyro_noise_density", "sensor.acc_noise_density", "sensor.gyro_bias_walk",
            "sensor.acc_bias_walk")
@@ -78,9 +79,15 @@ def _parameter(block: str) -> str:
     return block.replace("gnss_", "gnss.")
 
 
+def within_bounds(name: str, value: float) -> float:
+    """A value of a parameter ``sensor.*``, or the nearest that it can have."""
+    allowed = SENSOR[name.removeprefix("sensor.")]
+    return min(max(value, allowed["low"]), allowed["high"])
+
+
 def _with(model: Model, factors: NoiseFactors) -> Model:
     """The model with its noise multiplied by the factors."""
-    changes = {name: float(factor) * model.params.get(name)
+    changes = {name: within_bounds(name, float(factor) * model.params.get(name))
                for name, factor in zip(_SENSOR, (*factors.noise, *factors.walk))}
     for name, (walk, tau) in factors.wander.items():
         parameter = _parameter(name)
