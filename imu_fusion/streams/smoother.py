@@ -42,7 +42,7 @@ def required_of(params: SmootherParams) -> tuple[str, ...]:
     return _REQUIRED if params.initial.position is None else (IMU_TOPIC,)
 
 
-def lacking(params: SmootherParams, topics: Container[str]) -> list[str]:
+def lacking(params: SmootherParams, topics: Container[str | None]) -> list[str]:
     """What keeps the smoother from smoothing these topics: fixes are enough."""
     return [] if FIX_TOPIC in topics else [
         topic for topic in required_of(params) if topic not in topics]

@@ -83,7 +83,8 @@ class Stage:
         return params[:len(self.params)]
 
     def input_types(self) -> tuple[dict[str, str], dict[str, str], tuple[str, ...]]:
-        """Message types of the topics that are required, and of those that are not; ``dispensable``."""
+        """Message types of the topics that are required, and of those that are not, and
+        ``dispensable``."""
         types = {topic: kind.layout.msgtype for topic, kind in self.inputs.items()}
         return ({topic: types[topic] for topic in self.required},
                 {topic: name for topic, name in types.items() if topic not in self.required},

@@ -20,8 +20,8 @@ class PhaseParams(Parameters):
     """``phases.*``: thresholds."""
 
     free_fall: float = param(
-        FREE_FALL, unit="g", low=0.01, high=0.9, doc="Largest specific force of the ball's centre in "
-        "flight. Raise it for an accelerometer with errors of many percent.")
+        FREE_FALL, unit="g", low=0.01, high=0.9, doc="Largest specific force of the ball's centre "
+        "in flight. Raise it for an accelerometer with errors of many percent.")
     flight_time: float = param(
         FLIGHT_TIME, unit="s", low=0.02, doc="Shortest flight that counts.")
     first_flight_time: float = param(

@@ -51,10 +51,10 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
 
 def _on_missing_imu(result):
     if result.acc_density is not None:
-        yield ("no Imu samples: the trajectory is of fixes and velocities alone, and the attitude is "
-               "not known. Between them the velocity changes by white accelerations of "
-               f"{result.acc_density:.2g} m/s^2/sqrt(Hz) (maximum_likelihood fits them, "
-               "gap.acc_noise_density with 'off')")
+        yield ("no Imu samples: the trajectory is of fixes and velocities alone, and the attitude "
+               "is not known. Between them the velocity changes by white accelerations of "
+               f"{result.acc_density:.2g} m/s^2/sqrt(Hz)"
+               ", and the fixes wander by what is stated of them (gnss.position_error_sd)")
 
 
 def _on_stamps(result):

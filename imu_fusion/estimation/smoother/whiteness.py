@@ -41,7 +41,8 @@ def widen(samples: np.ndarray, wander: dict[str, float]) -> None:
     """Make the standard deviations of smoothed samples as much larger as innovations wander, or
     deviations from a surface.
 
-    What a receiver or a surface says bears on all. The field bears on headings: gravity tells the tilt.
+    What a receiver or a surface says bears on all. The field bears on headings: gravity tells the
+    tilt.
 
     Args:
         samples: of a SmootherResult, in place. wander: name -> factor.
