@@ -34,7 +34,7 @@ HEADFORM = (((18.0, 306.46, 83.10), ((0, -1, 0), (1, 0, 0), (0, 0, 1))),
             ((-17.3, 150.0, 18.0), ((0, -1, 0), (0, 0, 1), (-1, 0, 0))))
 METHODS = {"AO (paper)": {"method": "ao"}, "sqrt-AO": {"method": "sqrt_ao"},
            "causal filter": {}, "smoother": {"mode": "smoothed"}}
-EXACT = Sensor(acc_position_sd=0.0, acc_axes_sd=0.0, acc_bias_sd=0.0)
+EXACT = Sensor(acc_position_sd=0.0, acc_axes_sd=0.0, acc_scale_sd=0.0, acc_bias_sd=0.0)
 
 
 def load(name):

@@ -14,7 +14,7 @@ from imu_fusion.simulation.noise import ornstein_uhlenbeck
 from imu_fusion.simulation.rigid_body_impact import PAPER_AXES, PAPER_PARTICLE, PAPER_POSITIONS
 
 BETA = 1e3  # 1/s, Rahaman 2019, section 4.1.2
-EXACT = Sensor(acc_position_sd=0.0, acc_axes_sd=0.0)   # mounting, as simulated
+EXACT = Sensor(acc_position_sd=0.0, acc_axes_sd=0.0, acc_scale_sd=0.0)   # as simulated
 PARAMS = AccelerationFieldParams(
     sensor=EXACT, initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=1e-6),
     gravity=9.8)

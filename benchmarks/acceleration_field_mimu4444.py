@@ -70,7 +70,7 @@ def clipped_gyroscope(run):
     # The chips differ this much, by their scale factors; their mean is trusted no better.
     spread = np.sqrt(np.mean(np.var(gyr, axis=1)[~at_range.any(axis=1)]))
     gyroscope = EXACT.replace(gyro_noise_density=spread / np.sqrt(RATE) / BEGIN.noise_scale,
-                              gyro_range=(LIMIT,), gyro_axes_sd=0.0)
+                              gyro_range=(LIMIT,), gyro_axes_sd=0.0, gyro_scale_sd=0.0)
     fit = AccelerationFieldEstimator(BEGIN.replace(use_gyro=True, sensor=gyroscope),
                                      sensors(positions, noise))
     fit.run(stamp[:FIT_SAMPLES], acc[:FIT_SAMPLES], given[:FIT_SAMPLES])

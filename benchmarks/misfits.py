@@ -142,10 +142,11 @@ def felt(rng, position_sd=0.0, axes_sd=0.0, places=PLACES, jitter=0.0,
             + rng.normal(0.0, NOISE, clean.shape))
 
 
-def field_outcome(readings, accelerometers, params=FIELD, motion=MOTION, start=_START) -> Outcome:
+def field_outcome(readings, accelerometers, params=FIELD, motion=MOTION, start=_START,
+                  gyr=None) -> Outcome:
     """Outcome of one recording of an impact, without its first ``start`` samples."""
     estimator = AccelerationFieldEstimator(params, accelerometers)
-    rows = estimator.run(motion.stamp, readings)[start:]
+    rows = estimator.run(motion.stamp, readings, gyr)[start:]
     force = motion.specific_force_body(CENTRE)[start:]
     errors = {
         "omega": motion.omega[start:] - rows["omega"],
@@ -171,6 +172,21 @@ def field_row(situation, before, readings, changes=None, **params) -> Scenario:
     def run(seed):
         return field_outcome(readings(np.random.default_rng(seed)), layout(**(changes or {})),
                              FIELD.replace(**params))
+    return Scenario("Acceleration field", situation, before, run)
+
+
+def gyro_row(situation, before, bias=0.0, delay=0.0, scale_sd=0.0) -> Scenario:
+    """Scenario with a gyroscope, 1 mm and 2 deg off."""
+    params = FIELD.replace(**{"use_gyro": True, "sensor.gyro_noise_density": 0.02 / 1000 ** 0.5})
+
+    def run(seed):
+        rng = np.random.default_rng(seed)
+        readings = felt(rng, 1e-3, 0.035)
+        gyr = np.column_stack([np.interp(MOTION.t - delay, MOTION.t, rate)
+                               for rate in MOTION.omega.T])
+        gyr = (gyr * (1.0 + scale_sd * rng.standard_normal(3)) + bias * np.sign(rng.normal(size=3))
+               + rng.normal(0.0, 0.02, gyr.shape))
+        return field_outcome(readings, layout(), params, gyr=gyr)
     return Scenario("Acceleration field", situation, before, run)
 
 
@@ -280,6 +296,11 @@ def few_channels_row(situation, before, measured, motion, spoil=lambda readings:
     return Scenario("Acceleration field", situation, before, run)
 
 
+def fifth_stands_still(readings):
+    readings[100:, 4] = readings[100, 4]
+    return readings
+
+
 def second_in_g(readings):
     readings[:, 1] /= 9.81
     return readings
@@ -300,7 +321,7 @@ def six_uniaxial(seed):
 
 FIELD_ROWS = [
     field_row("clean, mounting known exactly (sd 0)", "", felt,
-              {"position_sd": 0.0, "axes_sd": 0.0}),
+              {"position_sd": 0.0, "axes_sd": 0.0, "scale_sd": 0.0}),
     field_row("clean, defaults", "", felt),
     field_row("clean, defaults, smoothed", "", felt, mode="smoothed"),
     field_row("positions off by 1 mm", "NEES 4,600", lambda rng: felt(rng, position_sd=1e-3)),
@@ -333,8 +354,16 @@ FIELD_ROWS = [
     field_row("x and y of one of four exchanged, 1 mm and 2 deg off", "", axes_exchanged),
     field_row("a fifth of the samples of one of four lost, 1 mm and 2 deg off", "", a_fifth_lost),
     field_row("rounded to 2 m/s^2", "", lambda rng: np.round(felt(rng) / 2.0) * 2.0),
-    field_row("scale of each axis off by 1 %, 1 mm and 2 deg off", "", scales_off),
+    field_row("scale of each axis off by 1 %, 1 mm and 2 deg off", "NEES 124", scales_off),
+    field_row("scale of each axis off by 1 %, 1 mm and 2 deg off, smoothed", "", scales_off,
+              mode="smoothed"),
+    gyro_row("with a gyroscope", ""),
+    gyro_row("with a gyroscope whose scales are off by 1 %", "", scale_sd=0.01),
+    gyro_row("with a gyroscope whose bias is 0.3 rad/s (gyro_bias_sd 0.02)", "silent", bias=0.3),
+    gyro_row("with a gyroscope that is 10 ms late", "silent in 1 of 3", delay=0.01),
     few_channels_row("twelve uni-axial accelerometers, 55 g, 2 kHz", "NEES 16", ["x"] * 12, FAST),
+    few_channels_row("one of twelve uni-axial accelerometers stands still", "NEES 28, silent",
+                     ["x"] * 12, MOTION, fifth_stands_still),
     few_channels_row("three tri-axial and a uni-axial one", "", ["xyz"] * 3 + ["x"], MOTION),
     few_channels_row("the same, one in g", "NaN", ["xyz"] * 3 + ["x"], MOTION, second_in_g),
 ]

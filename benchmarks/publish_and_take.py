@@ -65,6 +65,7 @@ def main(role, count):
             time.sleep(NAP)
     for p in outs:
         p.wait_for_all_acked(Duration(seconds=60))
+    node.destroy_node()
     rclpy.try_shutdown()
 
 

@@ -36,8 +36,10 @@ def main():
              f"fixes, whose height spans {np.ptp(fix.height[valid]):.0f} m.", "",
              "| | iterations | height of the trajectory, span m | vertical sd m, median | RMS of "
              "normalised fix innovations |", "|---|---|---|---|---|"]
-    for name, params, surface in (("white fixes", BASE, None), ("wandering fixes", WANDER, None),
-                                  ("wandering fixes, plane", FLAT, plane)):
+    for name, params, surface in (
+            ("white fixes, nothing fitted", BASE.replace(maximum_likelihood="off"), None),
+            ("white fixes, what the data tell (default)", BASE, None),
+            ("wandering fixes", WANDER, None), ("wandering fixes, plane", FLAT, plane)):
         try:
             result = Smoother(params, surface).run(imu, None, fix)
         except ImuFusionError as error:

@@ -16,18 +16,27 @@ from benchmarks.smoother_speed import FRAME, drive
 from benchmarks.table import write_table
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.points import at_antenna
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog
 from imu_fusion.simulation.jump_sensors import record
+from imu_fusion.simulation.noise_gnss import GnssErrors
 from imu_fusion.simulation.ski_jump import Fall, JumpParams, SkiJump
+from imu_fusion.simulation.walk import FRAME as WALKED
+from imu_fusion.simulation.walk import Walk, WalkErrors
+from imu_fusion.simulation.walk import record as record_walk
 from imu_fusion.surfaces.file import load_surface
 
-SEEDS, SECONDS = 20, 60.0
+SEEDS, WALKS, SECONDS = 20, 5, 60.0
 DEFAULTS = SmootherParams()
 SIMULATED = SmootherParams(gravity=9.8)
 # A receiver for the car: metres that wander over a minute, and what it states of itself.
 WANDER_SD, WANDER_TAU, WHITE_SD, STATED_SD = np.array([5.0, 5.0, 8.0]), 60.0, 0.7, 1.9
+# A phone's receiver: better in each fix than it says, and astray for half a minute.
+PHONE = {"gnss_rate": 1.0, "stated_sd": (4.0, 4.0, 6.0), "gnss": GnssErrors(
+    position_sd=(3.0, 3.0, 6.0), position_tau=30.0, correlated_share=0.97,
+    velocity_sd=(0.3, 0.3, 0.3))}
 
 
 @dataclass
@@ -158,6 +167,31 @@ def withheld(row):
     row.add(error, cov, result.remarks())
 
 
+def walks(outages: bool, with_velocity: bool = True, **errors) -> Callable:
+    """Walks of 134 s; error of the antenna in the middle of the recording without fixes for three
+    times 15 s, or over all of it."""
+    own = WalkErrors(**errors)
+
+    def run(row):
+        for seed in range(WALKS):
+            walk = Walk(134.0, np.random.default_rng([seed, 3]))
+            recorded = record_walk(walk, np.random.default_rng([seed, 4]), own)
+            fix, velocity = recorded.fix, recorded.velocity
+            t = (fix.stamp - recorded.imu.stamp[0]) * 1e-9
+            hold = outages & (((t - 40.0) % 30.0 < 15.0) & (t > 40.0) & (t < 115.0))
+            result = Smoother(DEFAULTS).run(recorded.imu, recorded.mag, fix[~hold],
+                                            velocity[~hold] if with_velocity else None)
+            samples = at_antenna(result.samples, result.states, DEFAULTS)
+            since = (samples["stamp"] - recorded.imu.stamp[0]) * 1e-9
+            scored = np.searchsorted(since, t[hold] if outages else t)
+            lever = np.array(own.lever_arm)
+            place = result.frame.to_enu(*WALKED.to_geodetic(
+                walk.antenna(since[scored], lever)[0]))
+            row.add(samples["position_world"][scored] - place, samples["cov_position"][scored],
+                    result.remarks())
+    return run
+
+
 def jumps(kind: type[SkiJump], *landings: dict) -> Callable:
     """Lengths of 11 to 126 m; the error is that of the length."""
     def run(row):
@@ -196,6 +230,17 @@ SITUATIONS = (
     ("the same, deep landings (sinking by up to 1.2 m)", "",
      jumps(SkiJump, {"sink_time": 0.12, "braking": 3.5})),
     ("the same, falls by 0.8 m", "", jumps(Fall, {}, {"sink_time": 0.12, "braking": 3.5})),
+    ("walk, RTK 5 Hz: 3 x 15 s without fixes", "NEES 16-25 (another walk)", walks(True)),
+    ("the same, fixes .08 s late, velocities .18 s", "",
+     walks(True, gnss=WalkErrors().gnss.replace(time_offset=0.08), velocity_late=0.1)),
+    ("the same, antenna 0.5 m above the sensor, not given", "",
+     walks(True, lever_arm=(0.1, 0.1, 0.5))),
+    ("the same, past iron that bends the field by 8 uT", "", walks(True, iron=8e-6)),
+    ("walk, 1 Hz, fixes of stated 4 m that wander by 3 m", "", walks(False, **PHONE)),
+    ("the same, past iron that bends the field by 20 uT", "",
+     walks(False, **PHONE, iron=20e-6, iron_length=2.0)),
+    ("the same, no velocities", "",
+     walks(False, False, **PHONE, iron=20e-6, iron_length=2.0)),
     ("real drive, defaults: 11 x 15 s without fixes", "NEES 16-25 (a walk)", withheld),
     ("real drive, wandering receiver, 4 Hz", "", car(1, True)),
     ("real drive, wandering receiver, 1 Hz", "7.7 m off, stated 1.9", car(4, True)),

@@ -110,6 +110,9 @@ def recorded_noise(bag: str | Path, topic: str = _IMU, mag_topic: str = _MAG,
     found = []
     for name, unit, stamp, values in parts:
         values = values[np.isfinite(values).all(axis=1)]
+        if len(values) < 2:
+            raise CalibrationError(f"{bag}: {name}: {len(values)} usable samples; "
+                                   + "; ".join(remarks))
         steps = np.diff(stamp) * 1e-9
         rate = 1.0 / float(np.median(steps))
         found.append(noise_of(name, unit, values, rate))

@@ -1,12 +1,9 @@
 """``imu_fusion calibrate``: sensors and their noise from recordings."""
 
-from pathlib import Path
-
 import click
 from rich.table import Table
 
 from imu_fusion.cli.common import console, end, warn
-from imu_fusion.errors import ParameterError
 
 
 @click.group()
@@ -39,10 +36,9 @@ def _show_calibration(title, rows, remarks, text, out, lost):
     if out is None:
         click.echo(text)
     else:
-        try:
-            Path(out).write_text(text)
-        except OSError as error:
-            raise ParameterError(f"{out}: cannot be written ({error.strerror})") from None
+        from imu_fusion.recordings.targets import whole_file
+        with whole_file(out, text.partition(", ")[0]) as file:    # a calibration of the same
+            file.write_text(text)
         click.echo(f"written: {out}")
     end(bool(lost))
 
@@ -101,7 +97,9 @@ def calibrate_noise(bag: str, topic: str, mag_topic: str, plot: str | None, out:
     lost = _begin(bag, out, plot)
     found, remarks = noise.recorded_noise(bag, topic, mag_topic, lost.append)
     if plot is not None:
-        noise.write_plot(found, plot)
+        from imu_fusion.recordings.targets import whole_file
+        with whole_file(plot, "<") as file:
+            noise.write_plot(found, file)
         click.echo(f"written: {plot}")
     _show_calibration("noise, x, y, z", [row for s in found for row in noise.noise_report(s)],
                       remarks, noise.noise_parameters(found, bag), out, lost)

@@ -74,8 +74,9 @@ def _table(reports):
 
 def _process_several(bags, out, with_report, options):
     """Whether something was lost. One that fails does not keep the others; exit code 1 then."""
-    from imu_fusion.recordings.summary import names_of, write_summary
+    from imu_fusion.recordings.summary import names_of, refuse_sources, write_summary
     names = names_of(bags)
+    refuse_sources(names, out, options["overwrite"])
     table, failed, incomplete = Table("recording", "estimator", "found"), False, False
     for name, bag in names.items():
         say(f"{bag}:")
@@ -188,13 +189,16 @@ def radar(bag: str, place: tuple[float, float, float], gates: str | None, gate_l
     """
     from imu_fusion.recordings.targets import refuse_files
     from imu_fusion.report.radar import write_radar_report
-    refuse_files([bag, gates], out)
+    refuse_files([bag, gates, surface], out)
     table = Table("trajectory and radar", "")
-    for row in write_radar_report(bag, place, out, gates, gate_length, along_beam,
-                                  surface):
+    lost: list[str] = []
+    for row in write_radar_report(bag, place, out, gates, gate_length, along_beam, surface,
+                                  lost.append):
         table.add_row(*row)
     console.print(table)
     click.echo(f"written: {out}")
+    warn(lost)
+    end(bool(lost))
 
 
 @click.command()

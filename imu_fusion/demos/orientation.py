@@ -3,7 +3,6 @@
 import time
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -14,10 +13,11 @@ from imu_fusion.evaluation.orientation_error import (
     shares_within,
     statistics,
 )
-from imu_fusion.messages.convert import attitude_log, bool_value
+from imu_fusion.messages.convert import attitude_log
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.report.contents import moving_changes
 from imu_fusion.report.recording import write_recording_report
 
 
@@ -55,12 +55,8 @@ def _compare(played, recorded):
     estimates = read_log(recorded, "imu/data", attitude_log)
     errors = orientation_errors(estimates.stamp, estimates.quat_world_imu,
                                 read_log(played, "reference/pose"), estimates.cov_attitude)
-    changes = [(log_time, bool_value(cdr)) for _, _, log_time, cdr
-               in played.messages(["/reference/moving"])]
-    if not changes:
-        return errors, None
-    stamps, values = zip(*changes)
-    return errors, moving_at(errors.stamp, np.array(stamps), np.array(values))
+    changes = moving_changes(played)
+    return errors, None if changes is None else moving_at(errors.stamp, *changes)
 
 
 def _message_table(played, recorded):

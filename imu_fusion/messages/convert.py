@@ -16,11 +16,12 @@ import numpy as np
 import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
 
-from imu_fusion.errors import TopicError
+from imu_fusion.errors import MessageError, TopicError
 from imu_fusion.geometry.rotation import quat_to_matrix
 from imu_fusion.geometry.rotation_arrays import rpy_angles
 from imu_fusion.kernels import njit
 from imu_fusion.messages.layouts import (
+    BOOL_TYPE,
     FIX,
     IMU,
     LITTLE,
@@ -163,7 +164,13 @@ def bool_message(value: bool) -> bytes:
 
 
 def bool_value(cdr: bytes) -> bool:
-    """The value of a CDR std_msgs/Bool."""
+    """The value of a CDR std_msgs/Bool.
+
+    Raises:
+        MessageError: the bytes are no such message.
+    """
+    if len(cdr) < 5:
+        raise MessageError(f"{BOOL_TYPE}: {len(cdr)} bytes are too few")
     return cdr[4] == 1
 
 
@@ -278,19 +285,21 @@ GYROSCOPE_FIRST = replace(SAMPLE_TYPES[IMU.msgtype], values=gyroscope_first_valu
 
 
 def attitude_log(messages: Sequence[bytes]) -> AttitudeLog:
-    """AttitudeLog of a list of CDR sensor_msgs/Imu with orientation, such as imu/data.
+    """AttitudeLog of a list of CDR sensor_msgs/Imu with orientation, such as imu/data; NaN where
+    one of them says that it carries none.
 
     Raises:
-        TopicError: the messages say that they carry no orientation.
+        TopicError: all of them say so.
     """
     stamp, frames, values = IMU.decode_many(messages)
     cov_world = values[:, IMU["orientation_covariance"]].reshape(-1, 3, 3)
-    if (cov_world[:, 0, 0] == -1.0).any():
+    absent = cov_world[:, 0, 0] == -1.0
+    if len(absent) and absent.all():
         raise TopicError("these sensor_msgs/Imu carry no orientation (covariance[0] is -1): they "
                          "are raw data, not estimates")
     quat = values[:, IMU["orientation"]]
     # Zeros: a source that left them unset. Such an orientation is not a number.
-    known = (np.linalg.norm(quat, axis=1) > 0.5)[:, None]
+    known = ((np.linalg.norm(quat, axis=1) > 0.5) & ~absent)[:, None]
     rotation = np.empty((0, 3, 3))
     if len(quat):
         rotation = scipy.spatial.transform.Rotation.from_quat(

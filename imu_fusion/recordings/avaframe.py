@@ -9,7 +9,7 @@ from imu_fusion.errors import BagError, TopicError
 from imu_fusion.messages.layouts import FIX, NANOSECONDS, ODOMETRY
 from imu_fusion.recordings.bag_reader import Lose, Reader, open_bag
 from imu_fusion.recordings.logs import decoded_blocks
-from imu_fusion.recordings.targets import refuse_source
+from imu_fusion.recordings.targets import refuse_source, whole_file
 from imu_fusion.samples.blocks import joined
 
 _ODOMETRY, _FIX = "smoother/odometry", "smoother/fix"
@@ -75,10 +75,9 @@ def export_avaframe(path: str | Path, out: str | Path, crs: str | None = None,
     time = (stamp - stamp[0]) * 1e-9
     rows = np.unique(np.searchsorted(time, np.arange(0.0, time[-1] + 1e-9, interval)))
     table = particle_table(time[rows], position[rows], velocity[rows])
-    try:
-        np.savetxt(out, table, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.6f")
-    except OSError as error:
-        raise BagError(f"{out}: cannot be written ({error.strerror})") from None
+    header = ",".join(COLUMNS)
+    with whole_file(out, header) as file:
+        np.savetxt(file, table, delimiter=",", header=header, comments="", fmt="%.6f")
     return len(table)
 
 

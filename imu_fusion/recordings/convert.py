@@ -1,6 +1,5 @@
 """Recordings of other formats, and files of devices, as rosbag2 MCAP: whole or not at all."""
 
-import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from imu_fusion.recordings.array_parameters import array_parameters
 from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.repair import copy
-from imu_fusion.recordings.targets import refuse_files, refuse_source
+from imu_fusion.recordings.targets import refuse_files, refuse_source, whole_file
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.source import ARRAY_TOPIC
 
@@ -76,19 +75,14 @@ def convert(source: str | Path, out: str | Path, description: str | Path | None 
         named = {other: name for name, other in reader.recorded.items()}
         kept = [reader.require(named.get(find_topic(named, topic) or "", topic)).name
                 for topic in topics] or list(reader.topics)
-        beside = parameter_file.with_name(f".{parameter_file.name}.part")
-        try:
-            with BagWriter(out, overwrite=overwrite, whole=True) as writer:
-                messages: Messages = reader.messages(kept)
-                with (nullcontext(messages) if watch is None else watch(
-                        messages, sum(reader.topics[t].count or 0 for t in kept))) as watched:
-                    copy(reader, writer, kept, watched)
-                if text:
-                    _write(beside, text, parameter_file)
-            if text:
-                os.replace(beside, parameter_file)
-        finally:
-            beside.unlink(missing_ok=True)
+        with (whole_file(parameter_file) if text else nullcontext() as beside,
+              BagWriter(out, overwrite=overwrite, whole=True) as writer):
+            messages: Messages = reader.messages(kept)
+            with (nullcontext(messages) if watch is None else watch(
+                    messages, sum(reader.topics[t].count or 0 for t in kept))) as watched:
+                copy(reader, writer, kept, watched)
+            if beside is not None:
+                beside.write_text(text)
         return Converted(dict(writer.counts), parameter_file if text else None,
                          list(reader.warnings), reader.damaged, reader.format)
 
@@ -108,9 +102,3 @@ def _parameters(reader: Reader, array: Description, path: Path) -> str:
     return (f"# Made from {reader.path.name} as {path.name} says.\n"
             + array_parameters(array, stamps, str(path)))
 
-
-def _write(file: Path, text: str, target: Path) -> None:
-    try:
-        file.write_text(text)
-    except OSError as error:
-        raise BagError(f"{target}: cannot be written ({error.strerror})") from None

@@ -1,11 +1,10 @@
 """A first description of a table."""
 
-import os
 from pathlib import Path
 
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.source_storage import format_of
-from imu_fusion.recordings.targets import refuse_files
+from imu_fusion.recordings.targets import refuse_files, whole_file
 from imu_fusion.sources.sketch import sketch
 from imu_fusion.sources.transports.files import parts
 
@@ -41,11 +40,7 @@ def describe(source: str | Path, out: str | Path | None = None, overwrite: bool 
     refuse_files([source], out)
     if out.exists() and not overwrite:
         raise BagError(f"{out}: exists already; choose another name or --overwrite")
-    beside = out.with_name(f".{out.name}.part")
-    try:
-        beside.write_text(text)
-        os.replace(beside, out)
-    except OSError as error:
-        raise BagError(f"{out}: cannot be written ({error.strerror})") from None
+    with whole_file(out) as file:
+        file.write_text(text)
     return text, (f"written: {out}; check the guesses, then imu_fusion convert {source} OUT "
                   f"--description {out}")

@@ -3,11 +3,13 @@
 import csv
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from imu_fusion.errors import BagError
-from imu_fusion.recordings.results import read_results
+from imu_fusion.recordings.results import results_of
+from imu_fusion.sources.source import is_number
 
 _COLUMNS = ("recording", "measured")
 _NODE = "smoother"
@@ -46,15 +48,14 @@ def read_lengths(table: str | Path) -> tuple[tuple[str, ...], np.ndarray, np.nda
 
 def _length(table, line, row):
     """Estimated length, its standard deviation and the measured length of a row of the table."""
-    try:
-        measured = float(row["measured"])
-    except (TypeError, ValueError):
-        measured = math.nan
+    text = (row["measured"] or "").strip()
+    measured = float(text) if is_number(text) else math.nan
     if not 0.0 < measured < math.inf:
         raise BagError(f"{table}, line {line}: measured is {row['measured']!r}, no length in m")
     recording = table.parent / (row["recording"] or "")
-    results = (read_results(recording) or {}).get(_NODE, {})
-    if "jump" not in results:
+    jump: Any = results_of(recording, _NODE).get("jump")
+    try:
+        return float(jump["length"]), float(jump["length_sd"]), measured
+    except (TypeError, KeyError, ValueError):
         raise BagError(f"{table}, line {line}: {recording} holds no smoothed jump (process "
-                       "it with surface.file set to the hill)")
-    return results["jump"]["length"], results["jump"]["length_sd"], measured
+                       "it with surface.file set to the hill)") from None

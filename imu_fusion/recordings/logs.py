@@ -1,10 +1,11 @@
 """Topics of a recording as typed logs, decoded while they are read."""
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from imu_fusion.errors import TopicError
+from imu_fusion.errors import MessageError, TopicError
 from imu_fusion.messages.convert import SAMPLE_TYPES, SampleType
 from imu_fusion.messages.layouts import Decoded, Layout
 from imu_fusion.recordings.bag_reader import Reader
@@ -71,6 +72,34 @@ def decoded_blocks(reader: Reader, topic: str, layout: Layout) -> Iterator[Decod
         reader.lose(undecodable(topic, refused))
 
 
+def readable_messages(reader: Reader, topic: str, form: Layout | Callable[[bytes], object]
+                      ) -> list[bytes]:
+    """The messages of a topic that fit their type; ``reader.warnings`` says of the others.
+
+    Args:
+        reader, topic: as of :func:`read_log`.
+        form: their Layout, or what raises a MessageError of bytes that do not fit.
+
+    Raises:
+        TopicError: no such topic.
+    """
+    topic = reader.require(topic).name
+    messages = [cdr for *_, cdr in reader.messages([topic])]
+    refused = form.decode_block(messages).refused if isinstance(form, Layout) else {
+        i: why for i, cdr in enumerate(messages) if (why := _why_not(form, cdr))}
+    if refused:
+        reader.lose(undecodable(topic, Counter(refused.values())))
+    return [cdr for i, cdr in enumerate(messages) if i not in refused]
+
+
+def _why_not(form: Callable[[bytes], object], cdr: bytes) -> str:
+    try:
+        form(cdr)
+    except MessageError as error:
+        return str(error)
+    return ""
+
+
 def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = None) -> Any:
     """The log of one topic of an open recording: which subclass of Log, its type decides.
 
@@ -91,11 +120,7 @@ def read_log(reader: Reader, topic: str, log_of: Callable[[list], Log] | None = 
         raise TopicError(f"{reader.path}: topic '{info.name}' is {info.msgtype}; "
                          f"logs exist for {', '.join(sorted(SAMPLE_TYPES))}")
     if log_of is not None:
-        messages = [cdr for *_, cdr in reader.messages([info.name])]
-        refused = kind.layout.decode_block(messages).refused
-        if refused:
-            reader.lose(undecodable(info.name, dict.fromkeys(refused.values(), len(refused))))
-        return log_of([cdr for i, cdr in enumerate(messages) if i not in refused])
+        return log_of(readable_messages(reader, info.name, kind.layout))
     collector = LogCollector(kind)
     for *_, cdr in reader.messages([info.name]):
         collector.add(cdr)

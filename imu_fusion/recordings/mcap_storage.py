@@ -65,6 +65,17 @@ class _Block:
     first: int | None = None
     last: int | None = None
     counts: dict[int, int] = field(default_factory=dict)   # messages of each channel
+    claimed: tuple[int | None, int | None] = (None, None)   # first and last, by its header
+
+    def forget(self) -> None:
+        """What its index said of it."""
+        self.counts = {}
+        self.first, self.last = self.claimed
+
+    def claims(self, first: int, last: int) -> bool:
+        """Whether its header has these times."""
+        low, high = self.claimed
+        return low is not None and high is not None and low <= first and last <= high
 
     def saw(self, first: int, last: int) -> None:
         """Its log times are at least from ``first`` to ``last``."""
@@ -81,7 +92,7 @@ class McapStorage(FileStorage):
         self._schemas: dict[int, Schema] = {}
         # Those of the index: good as long as its checksum says so.
         self._index: tuple[dict[int, Channel], dict[int, Schema]] = {}, {}
-        self._in_index = False
+        self._index_at: int | None = None    # its first record, once that has come
         self._holes: list[tuple[int, int, _Block]] = []   # (bytes, number of the block after, lost)
         self._lost: _Block | None = None    # a chunk that is no more, though its index may be
         self._walk()
@@ -128,8 +139,10 @@ class McapStorage(FileStorage):
             # The chunk before it is shorter than it says: bytes are missing in it.
             self._blocks.pop()
             position = start = block.position
+        elif block is not None and block.compression is not None:
+            block.forget()    # a part of its index may be missing
         found = find_record(self._file, start)
-        if self._in_index:
+        if self._index_at is not None:
             self.mention(f"{self.path.name}: not closed properly: its index is damaged or cut off; "
                          "it is read without")
         else:
@@ -163,13 +176,14 @@ class McapStorage(FileStorage):
             block.counts[number] = block.counts.get(number, 0) + 1
             block.saw(log_time, log_time)
         elif opcode in (SCHEMA, CHANNEL):
-            channels, schemas = self._index if self._in_index else (self._channels, self._schemas)
+            channels, schemas = (self._channels, self._schemas) if self._index_at is None else (
+                self._index)
             define(opcode, self._file.read(content, end - content), channels, schemas)
-            if not self._in_index:    # read with the messages: one may contradict an earlier one
+            if self._index_at is None:    # read with the messages: it may contradict earlier ones
                 block = self._open_run(position)
                 block.size = block.unpacked = end - block.position
         elif opcode == DATA_END:
-            self._in_index = True
+            self._index_at = end
         elif opcode == FOOTER:
             self._check_index(position, self._file.read(content, 20))
 
@@ -178,8 +192,11 @@ class McapStorage(FileStorage):
         first, last, unpacked, crc, text = CHUNK_HEAD.unpack_from(head)
         compression = head[32:32 + text].decode("ascii", "replace")
         start = content + 40 + text
-        self._blocks.append(_Block(start, end - start, unpacked, compression, crc,
-                                   *((first, last) if first <= last else (None, None))))
+        block = _Block(start, end - start, unpacked, compression, crc)
+        if first <= last:
+            block.claimed = first, last
+        block.forget()
+        self._blocks.append(block)
 
     def _take_index(self, content: bytes) -> None:
         """How many messages of a channel the chunk before it holds, and when."""
@@ -188,6 +205,9 @@ class McapStorage(FileStorage):
             return
         (number,) = struct.unpack_from("<H", content)
         times = np.frombuffer(content, "<u8", offset=6)[::2]
+        if block is self._lost and self._blocks and self._blocks[-1].claims(times.min(),
+                                                                            times.max()):
+            return    # of the chunk before the damage, which is counted without
         if not block.counts:
             block.first = block.last = None    # exact from here on
         block.counts[number] = len(times)
@@ -205,6 +225,8 @@ class McapStorage(FileStorage):
     def _check_index(self, position: int, footer: bytes) -> None:
         """Forget what the index said if its checksum does not fit."""
         start, _, crc = struct.unpack("<QQI", footer)
+        if self._index_at is not None:
+            start = self._index_at    # where it is, should bytes be missing before it
         if not crc or not 0 < start <= position:
             return
         value, size = 0, position + HEAD.size + 16 - start
@@ -314,7 +336,7 @@ class McapStorage(FileStorage):
                      "missing")
             self.lose(f"{self.path.name}: {size if size > 0 else 'some'} bytes are {where}; "
                       f"{which}")
-        if not self._in_index and not self._holes:
+        if self._index_at is None and not self._holes:
             self.lose(f"{self.path.name}: not closed properly; what comes before is recovered, "
                       "what was not yet written to the disk is missing")
 

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from imu_fusion.errors import BagError
+from imu_fusion.sources.source import is_number
 from imu_fusion.sources.times import NANOSECONDS, calendar, is_calendar
 
 # What the name of a column begins or ends with, and its unit if the name has one in brackets.
 _COLUMNS = (("time", r"time|stamp", ("s", "utc")), ("range", r"range|distance", ("m",)),
             ("velocity", r"velocity|speed", ("m/s", "m s-1")))
+_LARGEST = 1e10    # of any number; times end in 2286
 _UNIX = 1e8    # s: later is a date, earlier counts from the start of the recording
 
 
@@ -73,8 +75,8 @@ def _value(path, line, name, row, place, start):
             return np.nan
         if name == "time" and is_calendar(text):
             return (calendar(text) - start) / NANOSECONDS
-        value = float(text)
-        if not np.isfinite(value) or (name == "range" and value <= 0.0):
+        value = float(text) if is_number(text) else np.nan
+        if not abs(value) < _LARGEST or (name == "range" and value <= 0.0):
             raise ValueError
     except ValueError:
         raise BagError(f"{path}, line {line}: {name} is '{text}'") from None

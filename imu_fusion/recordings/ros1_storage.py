@@ -1,7 +1,7 @@
 """ROS 1 bags (format 2.0), whole or damaged, their messages as CDR of ROS 2.
 
 As of MCAP the records are walked from the begin to the end, and where none follows the next chunk
-is searched for. Types come from the definitions that the bag holds for each connection.
+or message is searched for. Types come from the definitions that the bag holds for each connection.
 """
 
 import bz2
@@ -19,35 +19,52 @@ from rosbags.typesys.store import Typestore
 from imu_fusion.errors import BagError
 from imu_fusion.messages.typestore import TYPES
 from imu_fusion.recordings.qos import qos_profile
+from imu_fusion.recordings.ros1_records import (
+    BAG,
+    CHUNK,
+    CONNECTION,
+    INDEX,
+    MAGIC,
+    MESSAGE,
+    Header,
+    Search,
+    compression,
+    fields,
+    header_at,
+    integer,
+    is_chunk,
+    record_at,
+    records,
+    time,
+)
 from imu_fusion.recordings.storage import (
     DamageError,
     FileStorage,
     Part,
     Row,
     StoredTopic,
-    Window,
     in_order,
     largest_chunk,
     span,
     unpack,
 )
 
-MAGIC = b"#ROSBAG V2.0\n"
-_MESSAGE, _BAG, _INDEX, _CHUNK, _INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-_HEADER = 1 << 20          # bytes that a header takes at most: definitions are in the data
 _DEFINITIONS = 1 << 24     # bytes of the data of a connection
+_LARGEST_INDEX = 1 << 26           # bytes of the index of a chunk
+_TOGETHER = 1 << 20        # bytes of records outside of chunks that are read at once
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-_SEARCH = 1 << 20
-_MARK = b"compression="    # of the header of a chunk
-_BEFORE = 64               # bytes from the begin of such a header to the mark, at most
 
 
 @dataclass
 class _Chunk:
+    """``loose``: not known by its header, but a run of records that are in none, or in one whose
+    length is wrong."""
+
     position: int
     size: int
     unpacked: int
     compression: str
+    loose: bool = False
     first: int | None = None
     last: int | None = None
     counts: dict[int, int] = field(default_factory=dict)
@@ -67,17 +84,20 @@ class Ros1Storage(FileStorage):
     def _open(self) -> None:
         self._chunks: list[_Chunk] = []
         self._connections: dict[int, _Connection] = {}
+        self._doubtful: dict[int, _Connection] = {}    # whose definition cannot be read
         self._stores: dict[str, Typestore] = {}
         self._broken: dict[str, int] = {}
         self._holes: list[tuple[int, int]] = []    # (bytes, number of the chunk after)
+        self._is_closed = True
         self._lost = False    # a chunk, though its index may still be there
-        if self._file.read(0, len(MAGIC)) != MAGIC:
-            raise BagError(f"{self.path}: not a ROS 1 bag of format 2.0 (it does not begin with "
-                           f"{MAGIC.decode().strip()}); rosbag migrate converts older ones")
         self._walk()
         self._count()
+        self._connections = self._doubtful | self._connections
         self._make_topics()
         self._tell_holes()
+        if not self._chunks and self._file.read(0, len(MAGIC)) != MAGIC:
+            raise BagError(f"{self.path}: not a ROS 1 bag of format 2.0 (it does not begin with "
+                           f"{MAGIC.decode().strip()}); rosbag migrate converts older ones")
         if not self._chunks:
             self.lose(f"{self.path.name}: holds no chunk: nothing was written, or the rest is "
                       "lost")
@@ -96,79 +116,110 @@ class Ros1Storage(FileStorage):
                       "out")
 
     def _walk(self) -> None:
-        position = len(MAGIC)
+        position = len(MAGIC) if self._file.read(0, len(MAGIC)) == MAGIC else 0
+        search = Search(self._file)
         while position < self._file.size:
-            record = _record(self._file, position)
-            if record is None or not self._take(*record[:3]):
-                start = position + 1
-                chunk = self._chunks[-1] if self._chunks else None
-                if chunk is not None and chunk.position + chunk.size == position:
-                    # Perhaps it is shorter than it says: what is inside of it is no chunk.
-                    start = chunk.position
-                found = self._find(start)
-                self._holes.append((found - position, len(self._chunks)))
-                self._lost = True
-                position = found
+            found = record_at(self._file, position)
+            if found is not None and self._take(position, *found):
+                position = found[2]
                 continue
-            position = record[3]
+            inside = self._open_chunk(position)
+            if inside is not None:
+                position = inside
+                continue
+            chunk = self._chunks[-1] if self._chunks else None
+            is_next = chunk is not None and chunk.position + chunk.size == position
+            # Perhaps that chunk is shorter than it says.
+            start = (chunk.position if chunk is not None and is_next and not chunk.loose
+                     else position + 1)
+            found_at = search.after(start)
+            self._holes.append((found_at - position, len(self._chunks)))
+            self._lost = True
+            position = found_at
 
-    def _find(self, start: int) -> int:
-        """Position of the next chunk, the size of the file without one."""
-        while start < self._file.size:
-            data = self._file.read(start, _SEARCH)
-            at = data.find(_MARK)
-            while at >= 0:
-                for before in range(12, min(_BEFORE, at) + 1):
-                    record = _record(self._file, start + at - before)
-                    if record is not None and record[0].get("op") == bytes([_CHUNK]) and (
-                            _chunk(*record[:3]) is not None):
-                        return start + at - before
-                at = data.find(_MARK, at + 1)
-            start += max(len(data) - _BEFORE - len(_MARK), 1)
-            if len(data) < _SEARCH:
-                break
-        return self._file.size
+    def _open_chunk(self, position: int) -> int | None:
+        """Where the records of a chunk begin, which are walked one by one if it is not packed and
+        its length is wrong: it is cut off, or bytes are missing in it."""
+        found = header_at(self._file, position)
+        chunk = self._chunks[-1] if self._chunks else None
+        if found is not None and found[0]["op"] == CHUNK and compression(found[0]) == "none":
+            begin = found[1]
+            self._holes.append((0, len(self._chunks)))
+            self._chunks.append(_Chunk(begin, 0, 0, "none", loose=True))
+        elif (chunk is not None and chunk.compression == "none" and not chunk.loose
+                and chunk.position + chunk.size == position):
+            begin = chunk.position
+            self._chunks[-1] = _Chunk(begin, 0, 0, "none", loose=True)
+        else:
+            return None
+        self._lost = True
+        return begin
 
-    def _take(self, header: dict[str, bytes], content: int, size: int) -> bool:
+    def _take(self, position: int, header: Header, begin: int, end: int) -> bool:
         """What one record of the file says; False if it is none."""
-        op = header.get("op", b"\0")
-        if op == bytes([_CHUNK]):
-            chunk = _chunk(header, content, size)
-            if chunk is None:
+        op, size = header["op"], end - begin
+        if op == CHUNK:
+            if not is_chunk(header, size):
                 return False
-            self._chunks.append(chunk)
+            self._chunks.append(_Chunk(begin, size, integer(header["size"]) or 0,
+                                       compression(header)))
             self._lost = False
-        elif op == bytes([_CONNECTION]):
-            self._connect(header, self._file.read(content, min(size, _DEFINITIONS)))
-        elif op == bytes([_INDEX]) and self._chunks and not self._lost:
-            self._take_index(header, content, size)
-        return len(op) == 1 and _MESSAGE <= op[0] <= _CONNECTION
+        elif op == MESSAGE or (op == CONNECTION and self._is_open(position)):
+            if not self._is_open(position) or self._chunks[-1].size > _TOGETHER:
+                self._chunks.append(_Chunk(position, 0, 0, "none", loose=True))
+            chunk = self._chunks[-1]
+            chunk.size = chunk.unpacked = end - chunk.position
+        elif op == CONNECTION:
+            self._connect(header, self._file.read(begin, min(size, _DEFINITIONS)))
+        elif op == INDEX and self._chunks and not self._lost:
+            self._take_index(header, begin, end)
+        elif op == BAG:
+            place = int.from_bytes(header.get("index_pos", b""), "little")
+            self._is_closed = 0 < place <= self._file.size
+        return True
 
-    def _take_index(self, header: dict[str, bytes], content: int, size: int) -> None:
-        number, count = _integer(header.get("conn")), _integer(header.get("count"))
+    def _is_open(self, position: int) -> bool:
+        """Whether a record belongs to the chunk before it, whose recorder was killed, or whose
+        length is wrong."""
+        chunk = self._chunks[-1] if self._chunks else None
+        return (chunk is not None and chunk.compression == "none"
+                and chunk.position + chunk.size == position
+                and (chunk.loose or chunk.size == 0))
+
+    def _take_index(self, header: Header, begin: int, end: int) -> None:
+        number, count = integer(header.get("conn")), integer(header.get("count"))
         chunk = self._chunks[-1]
-        if number is None or count is None or size != 12 * count or size > _SEARCH * 64:
+        if number is None or count is None or not end - begin == 12 * count <= _LARGEST_INDEX:
             return
-        times = [sec * 10**9 + nsec for sec, nsec, _ in
-                 struct.iter_unpack("<III", self._file.read(content, size))]
+        entries = [*struct.iter_unpack("<III", self._file.read(begin, end - begin))]
+        if any(place >= chunk.unpacked for _, _, place in entries):    # not of this chunk
+            self._lost = True
+            chunk.counts, chunk.first, chunk.last = {}, None, None
+            return
+        times = [sec * 10**9 + nsec for sec, nsec, _ in entries]
         chunk.counts[number] = chunk.counts.get(number, 0) + len(times)
         if times:
             chunk.first = min(times) if chunk.first is None else min(chunk.first, *times)
             chunk.last = max(times) if chunk.last is None else max(chunk.last, *times)
 
-    def _connect(self, header: dict[str, bytes], data: bytes) -> None:
-        number, fields = _integer(header.get("conn")), _fields(data)
-        if number is None or fields is None or number in self._connections:
+    def _connect(self, header: Header, data: bytes) -> None:
+        number, about = integer(header.get("conn")), fields(data)
+        if number is None or about is None or number in self._connections:
             return
         topic = header.get("topic", b"").decode("utf-8", "replace")
-        name = fields.get("type", b"").decode("utf-8", "replace")
+        name = about.get("type", b"").decode("utf-8", "replace")
         if not topic or not _NAME.fullmatch(name):
             return
         topic = "/" * topic.startswith("/") + "/".join(filter(None, topic.split("/")))
-        self._connections[number] = _Connection(
-            topic, normalize_msgtype(name),
-            fields.get("message_definition", b"").decode("utf-8", "replace"),
-            fields.get("latching") == b"1")
+        found = _Connection(topic, normalize_msgtype(name),
+                            about.get("message_definition", b"").decode("utf-8", "replace"),
+                            about.get("latching") == b"1")
+        try:
+            _types(found.msgtype, found.text)
+        except DamageError:    # it is written twice, in a chunk and behind all of them
+            self._doubtful[number] = found
+        else:
+            self._connections[number] = found
 
     def _count(self) -> None:
         """Unpack the chunks whose index is missing, or names connections that are unknown."""
@@ -177,16 +228,16 @@ class Ros1Storage(FileStorage):
                 continue
             indexed = bool(chunk.counts)
             try:
-                for header, content in _records(self._unpacked(chunk)):
-                    if header.get("op") == bytes([_CONNECTION]):
+                for header, content in records(self._unpacked(chunk)):
+                    if header.get("op") == CONNECTION:
                         self._connect(header, bytes(content))
-                    elif header.get("op") == bytes([_MESSAGE]) and not indexed:
-                        number, time = _integer(header.get("conn")), _time(header.get("time"))
-                        if number is None or time is None:
+                    elif header.get("op") == MESSAGE and not indexed:
+                        number, at = integer(header.get("conn")), time(header.get("time"))
+                        if number is None or at is None:
                             continue
                         chunk.counts[number] = chunk.counts.get(number, 0) + 1
-                        chunk.first = time if chunk.first is None else min(chunk.first, time)
-                        chunk.last = time if chunk.last is None else max(chunk.last, time)
+                        chunk.first = at if chunk.first is None else min(chunk.first, at)
+                        chunk.last = at if chunk.last is None else max(chunk.last, at)
             except DamageError:
                 continue    # told when it is read
 
@@ -222,6 +273,9 @@ class Ros1Storage(FileStorage):
             first = next((c.first for c in self._chunks[after:] if c.first is not None), None)
             self.lose(f"{self.path.name}: {size if size > 0 else 'some'} bytes are damaged or cut "
                       f"off; messages of {span(last, first)} may be missing")
+        if not self._is_closed and not self._holes:
+            self.lose(f"{self.path.name}: not closed properly; what comes before is recovered, "
+                      "what was not yet written to the disk is missing")
 
     def _unpacked(self, chunk: _Chunk) -> bytes:
         data = self._file.read(chunk.position, chunk.size)
@@ -239,29 +293,39 @@ class Ros1Storage(FileStorage):
 
     def _rows(self, chunk: _Chunk, wanted: dict[int, _Connection], start: int | None,
               stop: int | None) -> Iterator[Row]:
-        rows = []
+        rows, found, damaged = [], 0, 0
         try:
-            for header, content in _records(self._unpacked(chunk)):
-                if header.get("op") != bytes([_MESSAGE]):
-                    continue
-                connection = wanted.get(_integer(header.get("conn")) or 0)
-                time = _time(header.get("time"))
-                if connection is not None and time is not None and (
-                        start is None or time >= start) and (stop is None or time < stop):
-                    rows.append((time, connection, content))
+            data = self._unpacked(chunk)
         except DamageError as error:
-            self.lose(f"{self.path.name}: a chunk at byte {chunk.position} is damaged: {error}; "
-                      f"of its {sum(chunk.counts.values())} messages of "
-                      f"{span(chunk.first, chunk.last)} {len(rows)} are read")
+            self.lose(f"{self.path.name}: a chunk at byte {chunk.position} is left out: {error}; "
+                      f"{sum(chunk.counts.values()) or 'its'} messages of "
+                      f"{span(chunk.first, chunk.last)} are missing")
+            return
+        for header, content in records(data):
+            if not header:
+                damaged += len(content)
+            if header.get("op") != MESSAGE:
+                continue
+            found += 1
+            number, at = integer(header.get("conn")), time(header.get("time"))
+            connection = None if number is None else wanted.get(number)
+            if connection is not None and at is not None and (
+                    start is None or at >= start) and (stop is None or at < stop):
+                rows.append((at, connection, content))
+        if damaged:
+            missing = sum(chunk.counts.values()) - found
+            self.lose(f"{self.path.name}: {damaged} bytes in a chunk at byte {chunk.position} are "
+                      f"damaged; {missing if missing > 0 else 'some'} messages of "
+                      f"{span(chunk.first, chunk.last)} are missing")
         rows.sort(key=lambda row: row[0])
-        for time, connection, content in rows:
+        for at, connection, content in rows:
             try:
                 cdr = bytes(self._stores[connection.topic].ros1_to_cdr(
                     bytes(content), connection.msgtype))
             except Exception:
                 self._broken[connection.topic] = self._broken.get(connection.topic, 0) + 1
                 continue
-            yield time, connection.topic, cdr
+            yield at, connection.topic, cdr
 
 
 @lru_cache(maxsize=256)
@@ -287,11 +351,11 @@ def _store(msgtype: str, text: str) -> Typestore:
         return TYPES
     found = get_types_from_msg(text, msgtype)
     # Code is made from names: they are checked here, and constants left out.
-    found = {name: ([], [(word, kind) for word, kind in fields if not (
+    found = {name: ([], [(word, kind) for word, kind in members if not (
                 name == "std_msgs/msg/Header" and word == "seq")])
-             for name, (_, fields) in found.items()}
-    for name, (_, fields) in found.items():
-        for word in (*name.split("/"), *(word for word, _ in fields)):
+             for name, (_, members) in found.items()}
+    for name, (_, members) in found.items():
+        for word in (*name.split("/"), *(word for word, _ in members)):
             if not word.isidentifier() or keyword.iskeyword(word):
                 raise DamageError(f"'{word[:40]}' in its definition is no name")
     _refuse_recursion(found)
@@ -319,80 +383,3 @@ def _refuse_recursion(types: dict) -> None:
             return
         depth = deeper
     raise DamageError("a type in its definition contains itself")
-
-
-def _record(file: Window, position: int) -> tuple[dict[str, bytes], int, int, int] | None:
-    """(header, position and size of the data, end) of a record, None if there is none."""
-    if position < 0:
-        return None
-    head = file.read(position, 4)
-    if len(head) < 4:
-        return None
-    (length,) = struct.unpack("<I", head)
-    if not 0 < length <= _HEADER or position + 8 + length > file.size:
-        return None
-    fields = _fields(file.read(position + 4, length))
-    if not fields or len(fields.get("op", b"")) != 1:
-        return None
-    (size,) = struct.unpack("<I", file.read(position + 4 + length, 4))
-    content = position + 8 + length
-    return (fields, content, size, content + size) if content + size <= file.size else None
-
-
-def _records(data: bytes) -> Iterator[tuple[dict[str, bytes], memoryview]]:
-    """(header, data) of the records of a chunk.
-
-    Raises:
-        DamageError: at the first one whose lengths do not fit.
-    """
-    view, position = memoryview(data), 0
-    while position < len(data):
-        if position + 4 > len(data):
-            raise DamageError("a record is cut off")
-        (length,) = struct.unpack_from("<I", data, position)
-        start = position + 4 + length
-        if start + 4 > len(data):
-            raise DamageError("a length in it is wrong")
-        fields = _fields(bytes(view[position + 4:start]))
-        (size,) = struct.unpack_from("<I", data, start)
-        position = start + 4 + size
-        if not fields or position > len(data):    # none: zeros, by the million
-            raise DamageError("a record in it is damaged")
-        yield fields, view[start + 4:position]
-
-
-def _fields(data: bytes) -> dict[str, bytes] | None:
-    """The name=value pairs of a header, None if it is none."""
-    fields, position = {}, 0
-    while position < len(data):
-        if position + 4 > len(data):
-            return None
-        (length,) = struct.unpack_from("<I", data, position)
-        position += 4 + length
-        if position > len(data):
-            return None
-        name, sign, value = data[position - length:position].partition(b"=")
-        if not sign:
-            return None
-        fields[name.decode("ascii", "replace")] = value
-    return fields
-
-
-def _integer(value: bytes | None) -> int | None:
-    return int.from_bytes(value, "little") if value is not None and len(value) == 4 else None
-
-
-def _time(value: bytes | None) -> int | None:
-    if value is None or len(value) != 8:
-        return None
-    sec, nsec = struct.unpack("<II", value)
-    return sec * 10**9 + nsec
-
-
-def _chunk(header: dict[str, bytes], content: int, size: int) -> _Chunk | None:
-    unpacked = _integer(header.get("size"))
-    compression = header.get("compression", b"").decode("ascii", "replace")
-    if unpacked is None or compression not in ("none", "lz4", "bz2") or (
-            compression == "none" and unpacked != size):
-        return None
-    return _Chunk(content, size, unpacked, compression)

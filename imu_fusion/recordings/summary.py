@@ -8,6 +8,7 @@ from typing import Any
 
 from imu_fusion.errors import BagError
 from imu_fusion.recordings.results import read_results
+from imu_fusion.recordings.targets import refuse_files, refuse_source, whole_file
 
 SUMMARY_FILE = "summary.csv"
 
@@ -28,6 +29,26 @@ def names_of(bags: Iterable[str | Path]) -> dict[str, str | Path]:
     return names
 
 
+def refuse_sources(names: Mapping[str, str | Path], folder: Path, overwrite: bool) -> None:
+    """Refuse a folder for the estimates of recordings where one of them would go with what they
+    replace.
+
+    Args:
+        names: of :func:`names_of`. folder: theirs go to ``folder/NAME`` each. overwrite: whether a
+            table that is there may be replaced.
+
+    Raises:
+        BagError: names what is in the way.
+    """
+    for name in names:
+        for bag in names.values():
+            refuse_source(bag, folder / name)
+    refuse_files(names.values(), folder / SUMMARY_FILE)
+    if (folder / SUMMARY_FILE).exists() and not overwrite:
+        raise BagError(f"{folder / SUMMARY_FILE}: exists already; choose another folder or "
+                       "--overwrite")
+
+
 def write_summary(folder: Path, names: Iterable[str]) -> Path:
     """Write summary.csv: a row for each recording, a column for each number that was found.
 
@@ -44,14 +65,12 @@ def write_summary(folder: Path, names: Iterable[str]) -> Path:
     rows = [{"recording": name} | dict(_numbers(read_results(folder / name) or {}))
             for name in names]
     file = folder / SUMMARY_FILE
-    try:
+    with whole_file(file) as part:
         folder.mkdir(parents=True, exist_ok=True)
-        with open(file, "w", newline="") as stream:
+        with open(part, "w", newline="") as stream:
             writer = csv.DictWriter(stream, list(dict.fromkeys(key for row in rows for key in row)))
             writer.writeheader()
             writer.writerows(rows)
-    except OSError as error:
-        raise BagError(f"{file}: cannot be written ({error.strerror})") from None
     return file
 
 

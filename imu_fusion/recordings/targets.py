@@ -7,9 +7,9 @@ from pathlib import Path
 
 from imu_fusion.errors import BagError, ParameterError
 from imu_fusion.parameters.file import read_yaml
-from imu_fusion.recordings.results import RESULTS_FILE
 
 METADATA_FILE = "metadata.yaml"
+RESULTS_FILE = "results.json"
 LIBRARY = "imu_fusion"    # what the header of our MCAP files names
 
 # What we write into the directory of a recording beside its files.
@@ -61,6 +61,38 @@ def _identities(path: Path) -> Iterator[tuple[int, int]]:
         except OSError:    # a link that leads nowhere
             return
         yield status.st_dev, status.st_ino
+
+
+@contextlib.contextmanager
+def whole_file(path: str | Path, begins: str = "") -> Iterator[Path]:
+    """A file to write, which takes the place of ``path`` when it is complete: where the context is
+    left by an exception, what was there stays, and nothing is left beside it.
+
+    Args:
+        begins: what the files begin with that may be replaced; empty: any may.
+
+    Raises:
+        BagError: it cannot be written, or something else is in its place.
+    """
+    target = Path(os.path.realpath(path))    # of a link what it leads to
+    part = target.with_name(f".part-{os.getpid()}{target.suffix}")
+    try:
+        if target.exists() and not target.is_file():
+            part = target    # /dev/stdout, which is written to and not replaced
+        elif target.exists() and target.stat().st_size:
+            with open(target, "rb") as stream:
+                if stream.read(len(begins.encode())) != begins.encode():
+                    raise BagError(f"{path}: exists already and is something else; choose another "
+                                   "name")
+        yield part
+        if part != target:
+            os.replace(part, target)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        if part != target:
+            with contextlib.suppress(OSError):
+                part.unlink()
 
 
 def make_parents(target: Path) -> list[Path]:

@@ -1,6 +1,7 @@
 """What a report needs of recordings: their logs, estimates and what was wrong with them."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from imu_fusion.batch import estimate
-from imu_fusion.errors import TopicError
+from imu_fusion.errors import MessageError, TopicError
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.messages.convert import attitude_log, bool_value
-from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST
-from imu_fusion.messages.orientation_status import FLAGS_TYPE
+from imu_fusion.messages.layouts import BOOL_TYPE, FIX, IMU, MAG, POSE, TWIST, Layout
+from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_value
 from imu_fusion.parameters.file import ParamsFile
 from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
 from imu_fusion.recordings.inspect import TopicReport, inspect_topics
+from imu_fusion.recordings.logs import readable_messages
 from imu_fusion.report.orientation_status import Status
 from imu_fusion.report.smoother import Smoothed
 from imu_fusion.report.trajectory_data import read_result
@@ -31,7 +33,10 @@ FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
 REFERENCE, MOVING = "reference/pose", "reference/moving"
 ORIENTATION, SMOOTHER = "orientation_estimator", "smoother"
 
-_ESTIMATES = {ESTIMATES: IMU.msgtype, FLAGS_TOPIC: FLAGS_TYPE, BIAS_TOPIC: TWIST.msgtype}
+# Types, and what reads them.
+_ESTIMATES: dict[str, tuple[str, Layout | Callable[[bytes], object]]] = {
+    ESTIMATES: (IMU.msgtype, IMU), FLAGS_TOPIC: (FLAGS_TYPE, flags_value),
+    BIAS_TOPIC: (TWIST.msgtype, TWIST)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,24 +104,27 @@ class Estimates:
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """What a recording holds of estimates: of the orientation; of the smoother, or else why there
-    is none; its ``remarks``, and those of others beside the recording; names of its ``topics``."""
+    is none; its ``remarks``, and those of others beside the recording; names of its ``topics``;
+    what of it is lost, in words."""
 
     orientation: Estimates
     trajectory: SmootherResult | None
     obstacle: str
     remarks: list[str]
     topics: list[str]
+    losses: list[str]
 
 
 def read_recorded(path: str | Path, remap: Mapping[str, str] | None = None) -> Recorded:
     """The estimates in a recording; remap: topic names of ours to those in it."""
     with open_bag(path, remap=remap) as reader:
-        orientation = _estimates({
-            name: [cdr for *_, cdr in reader.messages([reader.require(name).name])]
-            for name, msgtype in _ESTIMATES.items() if _has(reader, name, msgtype)})
+        found = {name: readable_messages(reader, name, form)
+                 for name, (msgtype, form) in _ESTIMATES.items() if _has(reader, name, msgtype)}
+        orientation = _estimates({name: cdrs for name, cdrs in found.items() if cdrs})
         trajectory, remarks, obstacle = read_result(reader)
         return Recorded(orientation, trajectory, obstacle,
-                        [f"{SMOOTHER}: {remark}" for remark in remarks], list(reader.topics))
+                        [f"{SMOOTHER}: {remark}" for remark in remarks], list(reader.topics),
+                        reader.losses)
 
 
 def make_estimates(bag: str | Path, params_file: ParamsFile, with_orientation: bool,
@@ -165,8 +173,12 @@ def moving_changes(reader: Reader) -> tuple[np.ndarray, np.ndarray] | None:
     """(stamps, values) of the movement mask's changes, or None."""
     if not _has(reader, MOVING, BOOL_TYPE):
         return None
-    name = reader.require(MOVING).name
-    pairs = [(log_time, bool_value(cdr)) for _, _, log_time, cdr in reader.messages([name])]
+    pairs = []
+    for _, _, log_time, cdr in reader.messages([reader.require(MOVING).name]):
+        with contextlib.suppress(MessageError):
+            pairs.append((log_time, bool_value(cdr)))
+    if not pairs:
+        return None
     stamps, values = zip(*pairs)
     return np.array(stamps), np.array(values)
 

@@ -1,6 +1,6 @@
 """What the report needs of an acceleration field: estimates and readings, read from recordings."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from imu_fusion.messages.convert import attitude_log
 from imu_fusion.messages.layouts import ACCEL, IMU
 from imu_fusion.parameters.file import ParamsFile, files_of
 from imu_fusion.recordings.bag_reader import find_topic, open_bag
-from imu_fusion.recordings.logs import read_log
-from imu_fusion.recordings.results import read_results
+from imu_fusion.recordings.logs import read_log, readable_messages
+from imu_fusion.recordings.results import read_results, results_of
 from imu_fusion.streams.acceleration_field import (
     ACCEL_TOPIC,
     GYROSCOPE_TOPIC,
@@ -33,7 +33,8 @@ class FieldData:
 
     ``readings`` maps accelerometers to (n, 3) m/s^2 in their own axes, NaN where there is none;
     ``gyr`` (n, 3) rad/s of the gyroscope in body axes, NaN where there is none, or None.
-    ``impacts`` and ``remarks``: what ``process`` has found beside the estimates.
+    ``impacts`` and ``remarks``: what ``process`` has found beside the estimates; ``losses``: what
+    of these cannot be read.
     """
 
     rows: np.ndarray
@@ -42,6 +43,7 @@ class FieldData:
     gyr: np.ndarray | None
     impacts: list
     remarks: tuple[str, ...] = ()
+    losses: Sequence[str] = ()
 
     @property
     def points(self) -> np.ndarray:
@@ -98,9 +100,10 @@ def read_field(bag: str | Path, estimates: str | Path,
     with open_bag(estimates) as reader:
         if any(find_topic(reader.topics, t) is None for t in (IMU_TOPIC, ACCEL_TOPIC)):
             return None
-        imu = read_log(reader, IMU_TOPIC, attitude_log)
-        covs = _covariances(reader)
-        stamps, _, values = ACCEL.decode_many(_messages(reader, ACCEL_TOPIC))
+        messages = readable_messages(reader, IMU_TOPIC, IMU)
+        imu, covs = attitude_log(messages), _covariances(messages)
+        stamps, _, values = ACCEL.decode_many(readable_messages(reader, ACCEL_TOPIC, ACCEL))
+        losses = reader.losses
     shared, i, j = np.intersect1d(imu.stamp, stamps, return_indices=True)
     if len(shared) == 0:
         return None
@@ -112,23 +115,18 @@ def read_field(bag: str | Path, estimates: str | Path,
         if limit is not None:
             with np.errstate(invalid="ignore"):
                 rows["flags"][(np.abs(reading) >= limit).any(axis=1)] |= SATURATED
-    found = read_results(estimates)
-    beside = {} if found is None else found.get(NODE, {})
-    if found is None and files_of(params_file):
+    beside = results_of(estimates, NODE)
+    if read_results(estimates) is None and files_of(params_file):
         impacts = measure_impacts(rows, config.field.points, config.field.gravity,
                                   config.stream.impact)
     else:
         impacts = beside.get("impacts", [])
-    return FieldData(rows, config, readings, gyr, impacts, tuple(beside.get("remarks", ())))
+    return FieldData(rows, config, readings, gyr, impacts, tuple(beside.get("remarks", ())), losses)
 
 
-def _messages(reader, topic):
-    return [cdr for *_, cdr in reader.messages([find_topic(reader.topics, topic)])]
-
-
-def _covariances(reader):
+def _covariances(messages):
     """(n, 2, 3, 3) of rates and specific force as published."""
-    _, _, values = IMU.decode_many(_messages(reader, IMU_TOPIC))
+    _, _, values = IMU.decode_many(messages)
     return np.stack([values[:, IMU[f"{field}_covariance"]].reshape(-1, 3, 3) for field in
                      ("angular_velocity", "linear_acceleration")], axis=1)
 

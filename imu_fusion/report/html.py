@@ -19,10 +19,11 @@ import numpy as np
 import plotly.graph_objects
 
 import imu_fusion
-from imu_fusion.errors import ImuFusionError
+from imu_fusion.recordings.targets import whole_file
 
 # A number with its unit, a dash for none, or nothing: columns of these are set to the right.
 _NUMBER = re.compile(r"^([-+]?\d[\d.,]*(e[-+]?\d+)?( ?\S{1,4})?|–|)$")
+_BEGIN = "<!DOCTYPE html>"
 _SENTENCE = 40    # characters: longer cells are read, not looked up
 
 
@@ -180,15 +181,12 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section], subt
         sections: in order.
 
     Raises:
-        ImuFusionError: the file cannot be written.
+        BagError: the file cannot be written, or is there and no HTML.
     """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(render_report(title, sections, subtitle), encoding="utf-8",
+    with whole_file(path, _BEGIN) as file:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(render_report(title, sections, subtitle), encoding="utf-8",
                         errors="backslashreplace")    # names of files may be no text
-    except OSError as error:
-        raise ImuFusionError(f"{path}: the report cannot be written ({error.strerror})") from None
 
 
 def render_report(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
@@ -202,7 +200,7 @@ def render_report(title: str, sections: Sequence[Section], subtitle: str = "") -
         + "".join(block.render() for block in section.blocks) + "</section>"
         for anchor, section in zip(anchors, sections))
     style = _own("report.css")
-    return f"""<!DOCTYPE html>
+    return f"""{_BEGIN}
 <html lang="en">
 <head>
 <meta charset="utf-8">

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from imu_fusion.errors import ImuFusionError
+from imu_fusion.recordings.targets import whole_file
 from imu_fusion.report.html import Figure, Section
 
 COLUMN_WIDTH = 3.5      # inches: 89 mm, a column of most journals
@@ -50,16 +51,16 @@ def write_figures(sections: Sequence[Section], folder: str | Path, form: str = "
     written = []
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
-        for section in sections:
-            figures = [block.figure for block in section.blocks if isinstance(block, Figure)]
-            stem = re.sub(r"[^a-z0-9]+", "_", section.title.lower()).strip("_")
-            for number, figure in enumerate(figures, 1):
-                file = Path(folder) / f"{stem}{f'_{number}' if len(figures) > 1 else ''}.{form}"
-                with rc_context(SETTINGS):
-                    draw(figure).savefig(file)
-                written.append(file)
     except OSError as error:
         raise ImuFusionError(f"{folder}: figures cannot be written ({error.strerror})") from None
+    for section in sections:
+        figures = [block.figure for block in section.blocks if isinstance(block, Figure)]
+        stem = re.sub(r"[^a-z0-9]+", "_", section.title.lower()).strip("_")
+        for number, figure in enumerate(figures, 1):
+            file = Path(folder) / f"{stem}{f'_{number}' if len(figures) > 1 else ''}.{form}"
+            with rc_context(SETTINGS), whole_file(file) as part:
+                draw(figure).savefig(part)
+            written.append(file)
     return written
 
 

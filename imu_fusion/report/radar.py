@@ -16,7 +16,7 @@ from imu_fusion.estimation.avalanche.radar import (
     range_differences,
 )
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.recordings.bag_reader import Reader, find_topic, open_bag
+from imu_fusion.recordings.bag_reader import Lose, Reader, find_topic, open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.radar import read_radar
 from imu_fusion.report import figures as fig
@@ -26,6 +26,7 @@ from imu_fusion.report.overview import number
 from imu_fusion.report.trajectory import thinned
 from imu_fusion.report.trajectory_data import read_result
 from imu_fusion.samples import seconds
+from imu_fusion.samples.guard import usable_part
 from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.file import load_surface
 
@@ -50,8 +51,9 @@ class Seen:
         return np.linalg.norm(self.position, axis=1)
 
 
-def read_seen(bag: str | Path, radar: LocalFrame) -> Seen:
-    """The smoothed trajectory of a recording, or else its fixes and their velocities.
+def read_seen(bag: str | Path, radar: LocalFrame, lose: Lose = lambda text: None) -> Seen:
+    """The smoothed trajectory of a recording, or else its fixes and their velocities; lose: called
+    with texts on what of it cannot be read.
 
     Raises:
         TopicError: there is neither.
@@ -59,10 +61,14 @@ def read_seen(bag: str | Path, radar: LocalFrame) -> Seen:
     with open_bag(bag) as reader:
         result, _, _ = read_result(reader)
         if result is not None:
+            for text in reader.losses:
+                lose(text)
             samples = result.samples
             place = result.frame.to_geodetic(samples["position_world"])
             return _seen(samples["stamp"], radar.to_enu(*place), samples["vel_world"], "smoothed")
         fix, velocity = (_log(reader, name, bag) for name in (FIX_TOPIC, VELOCITY_TOPIC))
+        for text in reader.losses:
+            lose(text)
     fix = fix[fix.usable]
     both, of_fix, of_velocity = np.intersect1d(fix.stamp, velocity.stamp, return_indices=True)
     if len(both) < 2:
@@ -76,7 +82,7 @@ def _log(reader: Reader, name, bag):
     if find_topic(reader.topics, name) is None:
         raise TopicError(f"{bag}: neither a smoothed trajectory nor {FIX_TOPIC} with "
                          f"{VELOCITY_TOPIC}: process the recording, and name OUT here")
-    return read_log(reader, name)
+    return usable_part(read_log(reader, name), name)[0]
 
 
 def _seen(stamp, position, vel, source):
@@ -103,8 +109,8 @@ def on_ground(seen: Seen, radar: LocalFrame, surface: Surface) -> Seen:
 
 def write_radar_report(bag: str | Path, place: Sequence[float], path: str | Path,
                        table: str | Path | None = None, gate_length: float = 25.0,
-                       along_beam: bool = False, surface: str | None = None
-                       ) -> list[tuple[str, str]]:
+                       along_beam: bool = False, surface: str | None = None,
+                       lose: Lose = lambda text: None) -> list[tuple[str, str]]:
     """Write the HTML report of a trajectory beside a radar.
 
     Args:
@@ -117,6 +123,7 @@ def write_radar_report(bag: str | Path, place: Sequence[float], path: str | Path
             too.
         surface: of :func:`~imu_fusion.surfaces.file.load_surface`, whose heights are taken in
             place of the trajectory's: fixes are off by metres; None: the trajectory's own.
+        lose: of :func:`read_seen`.
 
     Returns:
         what it says in numbers: (name, value with its unit).
@@ -125,7 +132,7 @@ def write_radar_report(bag: str | Path, place: Sequence[float], path: str | Path
         TopicError, BagError: nothing to compare. EstimationError: a trajectory without a way.
     """
     radar = LocalFrame(*place)
-    seen = read_seen(bag, radar)
+    seen = read_seen(bag, radar, lose)
     if surface is not None:
         seen = on_ground(seen, radar, load_surface(surface))
     secant = Secant.through(seen.position)

@@ -64,8 +64,8 @@ class _Material:
     """All that the sections tell of; None where there is no such thing.
 
     ``source``: where the estimates come from, in words; ``obstacle``: why there is no
-    trajectory; ``held``: topics of the recording with the estimates; ``warnings``: of the
-    recordings and the smoother.
+    trajectory; ``held``: topics of the recording with the estimates, and its ``losses``;
+    ``warnings``: of the recordings and the smoother.
     """
 
     contents: Contents
@@ -75,6 +75,7 @@ class _Material:
     smoothed: Smoothed | None
     obstacle: str | None
     held: list[str]
+    losses: list[str]
     field: FieldData | None
     warnings: list[str]
 
@@ -162,7 +163,7 @@ def write_recording_report(bag: str | Path, estimates: str | Path | None, path: 
     date = datetime.datetime.fromtimestamp(contents.start * 1e-9, datetime.UTC)
     write_report(path, Path(bag).resolve().name, sections,
                  f"{bag}, starts {date:%Y-%m-%d %H:%M:%S} UTC by its stamps")
-    return Written(material.smoothed, not contents.damaged, sections)
+    return Written(material.smoothed, not (contents.damaged or material.losses), sections)
 
 
 def _gather(bag, estimates, params_file, remap) -> _Material:
@@ -186,9 +187,11 @@ def _gather(bag, estimates, params_file, remap) -> _Material:
         warnings += made.warnings
         if smoothed is None:
             smoothed, obstacle = smoothed_of(smoother, origin)
+    field = read_field(bag, source, params_file, remap)
+    losses = [*recorded.losses, *(() if field is None else field.losses)]
     return _Material(contents, "this report's own run" if own else str(source), drawn.log,
-                     drawn.status, smoothed, obstacle, recorded.topics,
-                     read_field(bag, source, params_file, remap), list(dict.fromkeys(warnings)))
+                     drawn.status, smoothed, obstacle, recorded.topics, losses, field,
+                     list(dict.fromkeys([*warnings, *losses])))
 
 
 def _summary(material) -> Section:

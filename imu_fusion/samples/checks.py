@@ -118,6 +118,10 @@ def check_stamps(stamp: np.ndarray, name: str) -> list[Finding]:
         return [Finding("stamp", f"{name}: all stamps are zero; the source does not set "
                                  "header.stamp, and nothing can be estimated from it",
                         unusable=True)]
+    negative = int((stamp < 0).sum())
+    if negative:
+        result.append(Finding("stamp", f"{name}: {negative} stamp{_s(negative)} below zero, the "
+                                       f"least {stamp.min()}: these samples are left out"))
     times = timing(stamp)
     if times.backwards:
         first = int(np.flatnonzero(np.diff(stamp) < 0)[0]) + 1

@@ -59,6 +59,9 @@ SENSOR: dict[str, dict[str, Any]] = {
         unit="rad", low=0.0, high=0.5,
         doc="Standard deviation of how an accelerometer is turned, about each axis, as states; 0: "
             "known exactly, no states."),
+    "acc_scale_sd": dict(
+        low=0.0, high=0.5, doc="Standard deviation of the scale error of each axis of an "
+        "accelerometer, as states; 0: calibrated, no states."),
     "gyro_axes_sd": dict(
         unit="rad", low=0.0, high=0.5,
         doc="Standard deviation of how the gyroscope is turned, about each axis, as states; 0: "

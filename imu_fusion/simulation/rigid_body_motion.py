@@ -85,6 +85,8 @@ def ideal_readings(array: SensorArray, states: np.ndarray) -> np.ndarray:
         turn, shift = channel["turn"], channel["shift"]
         if turn >= 0:
             u = Rotation.from_rotvec(states[0, turn:turn + 3]).apply(u)
+        if channel["scale"] >= 0:
+            u = (1.0 + states[0, channel["scale"]]) * u
         if shift >= 0:
             r = r + states[0, shift:shift + 3]
         if channel["is_gyro"]:

@@ -5,9 +5,9 @@ from datetime import UTC, datetime
 from decimal import Decimal
 
 NANOSECONDS = 1_000_000_000
-_DATE = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ]\d")
-_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?")
-_FRACTION = re.compile(r"([.,]\d+)")
+_DATE = re.compile(r"[0-9]{4}[-/][0-9]{2}[-/][0-9]{2}[T ][0-9]")
+_CLOCK = re.compile(r"([0-9]{1,2}):([0-9]{2}):([0-9]{2})(?:[.,:]([0-9]+))?")
+_FRACTION = re.compile(r"([.,][0-9]+)")
 
 
 def is_calendar(text: str) -> bool:

@@ -17,6 +17,7 @@ from imu_fusion.nodes.pipeline import find_left_out, plan_pipeline
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
+from imu_fusion.recordings.mcap_records import HEAD, INDEX, MAGIC
 from imu_fusion.recordings.repair import repair
 from imu_fusion.samples.guard import Verdict
 from imu_fusion.streams.orientation import OrientationStream
@@ -123,6 +124,95 @@ def test_a_ros1_bag_is_read_around_its_hole(tmp_path):
         assert reader.damaged and len(after) - len(sound) <= 2
         assert [row for row in before if row in set(sound)] == sound
         assert len(after) >= (0.4 if broken == data[:at] else 0.7) * len(before)
+
+
+def in_one_chunk(folder):
+    """A ROS 1 bag as small ones are, its rows and its bytes."""
+    file = write_ros1(folder, 1 << 20)
+    return file, rows_of(file)[0], file.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["zeros", "foreign", "lost", "cut off"])
+def test_damage_in_the_only_chunk_of_a_ros1_bag_costs_what_it_touches(tmp_path, damage):
+    file, before, data = in_one_chunk(tmp_path)
+    at = len(data) // 2
+    filler = {"lost": b"", "foreign": random.Random(1).randbytes(1000)}.get(damage, bytes(1000))
+    file.write_bytes(data[:at] + (b"" if damage == "cut off" else filler + data[at + 1000:]))
+    after, reader = rows_of(file)
+    sound = [row for row in after if row in set(before)]
+    assert reader.damaged and [row for row in before if row in set(sound)] == sound
+    # The message into which the damage has bitten may be read as it is now.
+    assert len(after) - len(sound) <= 1
+    assert len(sound) >= (0.4 * len(before) if damage == "cut off" else len(before) - 8)
+
+
+def test_the_beginning_of_a_ros1_bag_is_not_all_of_it(tmp_path):
+    file, before, data = in_one_chunk(tmp_path)
+    header = data.index(b"compression=none") - 8
+    for broken in (bytes(13) + data[13:],                                  # what it begins with
+                   data[:13] + bytes(4096) + data[13 + 4096:],             # the header of the bag
+                   data[:header] + bytes(30) + data[header + 30:]):        # the one of the chunk
+        file.write_bytes(broken)
+        after, reader = rows_of(file)
+        assert after == before and reader.damaged
+
+
+def test_definitions_of_a_ros1_bag_stand_in_it_twice(tmp_path):
+    file, before, data = in_one_chunk(tmp_path)
+    behind = data.rindex(b"geometry_msgs/Quaternion")
+    file.write_bytes(data[:behind] + bytes(300) + data[behind + 300:])
+    assert rows_of(file)[0] == before
+    text = data.index(b"geometry_msgs/Quaternion")
+    assert text < behind
+    file.write_bytes(data[:text] + bytes(300) + data[text + 300:])
+    assert rows_of(file)[0] == before
+
+
+def test_a_ros1_recorder_that_was_killed_has_not_closed_its_chunk(tmp_path):
+    """Its header stands there, without a size: rosbag reindex reads on, too."""
+    file, before, data = in_one_chunk(tmp_path)
+    sizes = data.index(b"size=", data.index(b"compression=none")) + len("size=")
+    unclosed = data[:sizes] + bytes(8) + data[sizes + 8:len(data) // 2]
+    (tmp_path / "t.bag.active").write_bytes(unclosed)
+    after, reader = rows_of(tmp_path / "t.bag.active")
+    assert reader.damaged and after == before[:len(after)] and len(after) > 0.4 * len(before)
+
+
+def test_a_foreign_index_of_a_chunk_is_not_believed(tmp_path):
+    file, before, data = in_one_chunk(tmp_path)
+    entries = data.index(b"ver=", data.index(b"compression=none") + 1)
+    entries = data.index(struct.pack("<I", 12 * 300), entries) + 4    # of the Imu
+    file.write_bytes(data[:entries] + random.Random(2).randbytes(600) + data[entries + 600:])
+    after, reader = rows_of(file)
+    assert after == before and reader.end_time - 1 == max(row[2] for row in before)
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_a_damaged_index_of_a_chunk_hides_no_topic(tmp_path, compression):
+    file = write_mcap(tmp_path, compression)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    before, _ = rows_of(file)
+    data, indices, position = file.read_bytes(), [], len(MAGIC)
+    while len(indices) < 2:    # of the first chunk
+        opcode, length = HEAD.unpack_from(data, position)
+        indices += [position] * (opcode == INDEX)
+        position += HEAD.size + length
+    file.write_bytes(data[:indices[1]] + bytes(30) + data[indices[1] + 30:])
+    for topic in {row[0] for row in before}:
+        with open_bag(file) as reader:
+            assert list(reader.messages([topic])) == [row for row in before if row[0] == topic]
+            assert reader.damaged and "are missing" not in " ".join(reader.warnings)
+
+
+def test_bytes_that_are_missing_at_the_beginning_leave_the_index_good(tmp_path):
+    """With the definitions that are lost ahead of it."""
+    file = write_mcap(tmp_path, "lz4")
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    before, _ = rows_of(file)
+    data = file.read_bytes()
+    file.write_bytes(data[:20] + data[1000:])
+    after, reader = rows_of(file)
+    assert reader.damaged and len(after) > len(before) - 70 and set(after) < set(before)
 
 
 def test_a_database_is_read_around_its_damaged_pages(tmp_path):

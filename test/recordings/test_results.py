@@ -2,7 +2,10 @@
 
 import json
 
-from imu_fusion.recordings.results import read_results, write_results
+import pytest
+
+from imu_fusion.errors import BagError
+from imu_fusion.recordings.results import read_results, results_of, write_results
 
 
 def test_results_that_are_not_finite_become_null(tmp_path):
@@ -15,3 +18,10 @@ def test_results_that_are_not_finite_become_null(tmp_path):
 
 def test_a_recording_without_results_has_none(tmp_path):
     assert read_results(tmp_path) is None
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "[" * 100_000, '{"smoother": [1]}', "1" * 5000])
+def test_results_of_somebody_else_are_refused_by_name(tmp_path, text):
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(BagError, match="results.json"):
+        results_of(tmp_path, "smoother")

@@ -13,7 +13,7 @@ from imu_fusion.errors import BagError
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.mcap_writer import McapWriter
-from imu_fusion.recordings.targets import refuse_source, why_not_replaced
+from imu_fusion.recordings.targets import refuse_source, whole_file, why_not_replaced
 from test.recordings.test_bag import IMU, START, imu, write
 
 
@@ -54,6 +54,50 @@ def test_repair_and_report_do_not_write_over_their_source(tmp_path):
                       ["calibrate", "noise", str(bag), "--plot", str(bag / "metadata.yaml")]):
         result = CliRunner().invoke(cli, arguments)
         assert result.exit_code == 1 and "choose another name" in result.output
+    assert contents(tmp_path) == before
+
+
+def test_what_is_of_another_kind_is_not_replaced(tmp_path):
+    bag = write(tmp_path / "bag", 20)
+    notes = tmp_path / "notes.txt"
+    notes.write_text("what took years")
+    before = contents(tmp_path)
+    result = CliRunner().invoke(cli, ["report", str(bag), "--out", str(notes)])
+    assert result.exit_code == 1 and "is something else" in result.output
+    with pytest.raises(BagError, match="is something else"), whole_file(notes, "# Noise") as part:
+        part.write_text("# Noise of another")
+    assert contents(tmp_path) == before
+    for _ in range(2):    # a report takes the place of the one before
+        assert CliRunner().invoke(cli, ["report", str(bag), "--out", str(tmp_path / "r.html")]
+                                  ).exit_code == 0
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    file = tmp_path / "file.txt"
+    for there in ("", "before"):
+        with pytest.raises(BagError, match="file.txt: cannot be written"), whole_file(file) as part:
+            part.write_text("half")
+            raise OSError(28, "No space left on device")
+        assert file.exists() == bool(there) and list(tmp_path.iterdir()) == [file] * bool(there)
+        file.write_text("before")
+    (tmp_path / "link").symlink_to(file)
+    with whole_file(tmp_path / "link") as part:
+        part.write_text("after")
+    assert file.read_text() == "after" and (tmp_path / "link").is_symlink()
+    with pytest.raises(BagError, match="cannot be written"), whole_file(file / "x") as part:
+        part.write_text("")
+
+
+def test_several_results_go_where_none_of_the_recordings_lies(tmp_path):
+    first, second = write(tmp_path / "first", 20), write(tmp_path / "out" / "first", 20)
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "summary.csv").write_text("of somebody")
+    before = contents(tmp_path)
+    for out, words in (("out", "would be destroyed"), ("table", "exists already")):
+        result = CliRunner().invoke(cli, [
+            "process", str(first), str(second / "first_0.mcap"), str(tmp_path / out),
+            *(["--overwrite"] if out == "out" else [])])
+        assert result.exit_code == 1 and words in result.output
     assert contents(tmp_path) == before
 
 

@@ -58,6 +58,9 @@ def test_a_table_tells_its_columns_times_and_errors(tmp_path):
     assert list(read_radar(table, 10**18)[0]) == [1.5, 2.25]
     for text, words in (("Time,Range [km]\n", "expected m"), ("Time,x\n", "no column of range"),
                         ("time,range\n1,far\n", "line 2: range is 'far'"),
+                        ("time,range\n1,1_0\n", "range is '1_0'"),
+                        ("time,range\n\u0663,1\n", "time is"),
+                        ("time,range\n1e300,1\n", "time is '1e300'"),
                         ("time,range\n", "holds no row"), ("time,range\n1\n", "range is ''")):
         table.write_text(text)
         with pytest.raises(BagError, match=words):

@@ -14,7 +14,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.errors import ImuFusionError, TopicError
-from imu_fusion.messages.convert import imu_message, mag_message, pose_message
+from imu_fusion.messages.convert import (
+    bool_message,
+    imu_message,
+    mag_message,
+    pose_message,
+    velocity_message,
+)
+from imu_fusion.messages.diagnostics import DIAGNOSTICS_TYPE, diagnostics_message
+from imu_fusion.messages.layouts import BOOL_TYPE, IMU, ODOMETRY, TWIST
+from imu_fusion.messages.orientation_status import FLAGS_TYPE, flags_message
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.report.figures import (
     Band,
@@ -271,6 +280,34 @@ def test_damaged_samples_are_left_out_and_told(tmp_path):
     assert "reference/pose: 1 orientations are zero" in text
     assert "1 samples left out: repeated stamp" in text
     assert "not finite" in text
+
+
+def test_broken_messages_of_estimates_are_left_out_and_told(tmp_path):
+    """One of each kind in eighty; and results of a smoother that it never wrote."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(80):
+            stamp = START + i * 10_000_000
+            forces = [0.0, 0.1, 9.81]
+            made = {"/imu/data_raw": (IMU.msgtype, imu_message(stamp, "i", np.zeros(3), forces)),
+                    "/imu/data": (IMU.msgtype, imu_message(stamp, "i", np.zeros(3), forces,
+                                                           [0, 0, 0, 1], np.eye(3) * 1e-4)),
+                    "/imu/flags": (FLAGS_TYPE, flags_message(stamp, "i", 1)),
+                    "/imu/gyro_bias": (TWIST.msgtype, velocity_message(stamp, "i", np.zeros(3))),
+                    "/reference/moving": (BOOL_TYPE, bool_message(i > 40)),
+                    "/smoother/odometry": (ODOMETRY.msgtype, ODOMETRY.encode(
+                        stamp, "world", np.zeros(ODOMETRY.size), "i")),
+                    "/smoother/imu": (IMU.msgtype, imu_message(stamp, "i", np.zeros(3), forces)),
+                    "/smoother/results": (DIAGNOSTICS_TYPE, diagnostics_message(
+                        stamp, "", "smoother", "", {"origin": "[1]", "states": "3"}))}
+            for topic, (msgtype, cdr) in made.items():
+                writer.write(topic, msgtype, cdr[:4] if i == 30 else cdr, stamp)
+    out = tmp_path / "report.html"
+    written = write_recording_report(tmp_path / "bag", tmp_path / "bag", out)
+    text = Page(out.read_text()).text
+    assert not written.complete and written.smoothed is None
+    for topic in ("imu/data", "imu/flags", "imu/gyro_bias"):
+        assert f"/{topic}: 1 messages cannot be decoded" in text, topic
+    assert "holds a trajectory that cannot be read" in text
 
 
 def test_a_recording_without_messages_is_told(tmp_path):

@@ -71,6 +71,11 @@ def test_degenerate_streams_have_no_rate(stamp):
     checks.check_stamps(np.array(stamp, dtype=np.int64), "x")
 
 
+def test_stamps_below_zero_are_told():
+    (finding,) = checks.check_stamps(np.arange(-3, 5) * 10_000_000, "imu/data_raw")
+    assert "3 stamps below zero, the least -30000000" in finding.text
+
+
 def test_unset_stamps_are_told():
     (finding,) = checks.check_stamps(np.zeros(5, np.int64), "imu/data_raw")
     assert "zero" in finding.text

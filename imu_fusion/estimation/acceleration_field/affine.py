@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
+from imu_fusion.estimation.acceleration_field.measurement import unused_flags
 from imu_fusion.estimation.acceleration_field.motion_model import (
     ACC,
     ACC_RATE,
@@ -27,9 +28,7 @@ from imu_fusion.estimation.acceleration_field.params import AccelerationFieldPar
 from imu_fusion.estimation.acceleration_field.rows import (
     GAP,
     HELD,
-    MISSING,
     ROW,
-    SATURATED,
     put_row,
     rigid_gradient,
 )
@@ -179,7 +178,7 @@ def advance(state, par, channels, design, stamp, readings, rows):
 
     state: (1,) STATE, par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, design:
     (m, 12), its columns multiplied by ``scale`` of par. stamp: (n,) int64 ns. readings: (n, m),
-    NaN for missing and inf for saturated ones.
+    NaN for missing, inf for saturated ones, -inf for those that stand still.
     """
     s, p = state[0], par[0]
     m = len(channels)
@@ -224,10 +223,7 @@ def _find_used(reading, used):
     flags = 0
     for c in range(len(used)):
         used[c] = math.isfinite(reading[c])
-        if math.isnan(reading[c]):
-            flags |= MISSING
-        elif not used[c]:
-            flags |= SATURATED
+        flags |= unused_flags(reading[c], used[c])
     return flags
 
 

@@ -39,7 +39,7 @@ CHECK = np.dtype([
 _GATE = 5.0
 _PROOF = 10.0       # samples left out that make an accelerometer faulty
 _MOST = 50.0        # beyond which evidence does not grow
-_SCALE = 1e-3       # of what it feels: no accelerometer is truer
+_TRUE = 1e-3        # of what it feels: no accelerometer is truer, whatever scale_sd says
 _SHARE = 1e-3       # of a channel's reading that must be left over for a check of it
 _FAR_BETTER = 10.0  # times smaller variances of a and alpha
 _EXCITING = 20.0    # times the noise: what turning must make of readings to tell of the mounting
@@ -232,17 +232,20 @@ def linearise_well(state, p, channels, at, work):
             linearise(channels, at, work)
     for c in range(len(channels)):
         channel = channels[c]
-        turned, shifted = 0.0, 0.0
+        turned, shifted, scaled = 0.0, 0.0, 0.0
         for i in range(3):
             if channel.turn >= 0:
                 turned += cov[channel.turn + i, channel.turn + i]
             if channel.shift >= 0:
                 shifted += cov[channel.shift + i, channel.shift + i]
-        # Of two isotropic vectors a and b, (a x u) . b has this share of their variances' product.
+        if channel.scale >= 0:
+            scaled = cov[channel.scale, channel.scale]
+        # Of two isotropic vectors a and b, (a x u) . b has 2/9 of their variances' product, u . b a
+        # third of b's.
         r = channel.lever
         lever = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
         felt = spin if channel.is_gyro else force + lever * turning
-        work.doubt[c] += 2.0 / 9.0 * (turned * felt + shifted * turning)
+        work.doubt[c] += 2.0 / 9.0 * (turned * felt + shifted * turning) + scaled * felt / 3.0
         if not channel.is_gyro:
             work.doubt[c] += 0.5 * lever * spin * spin
 
@@ -268,6 +271,9 @@ def learns_mounting(state, p, channels, at, work):
             if channel.shift >= 0:
                 left += state.cov[channel.shift + i, channel.shift + i] / channel.position_sd ** 2
                 first += 1.0
+        if channel.scale >= 0:
+            left += state.cov[channel.scale, channel.scale] / channel.scale_sd ** 2
+            first += 1.0
     return (p.radius * p.radius * (turning + speed * speed) > _EXCITING * _EXCITING * noise
             and left > _LEFT * _LEFT * first)
 
@@ -306,7 +312,8 @@ def _allow(state, p, channels, reading, at, work):
         turning += alpha * alpha
     for c in range(len(channels)):
         channel = channels[c]
-        work.variance[c] += ((channel.axes_sd * channel.axes_sd + _SCALE * _SCALE)
+        work.variance[c] += ((channel.axes_sd * channel.axes_sd
+                              + channel.scale_sd * channel.scale_sd + _TRUE * _TRUE)
                              * 3.0 * squares / count
                              + channel.position_sd * channel.position_sd * turning)
 

@@ -36,6 +36,7 @@ from imu_fusion.estimation.acceleration_field.sensor_faults import (
     fit_remarks,
     sensor_fits,
 )
+from imu_fusion.estimation.acceleration_field.standing_axes import StandingAxes
 from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
 
 
@@ -88,23 +89,26 @@ class AccelerationFieldEstimator:
         self._readings: list[np.ndarray] = []
         self._late: list[np.ndarray] = []    # rows of mode smoothed before its first sample
         self._limits = RangeLimits(self.array)
+        self._standing = StandingAxes(self.array)
 
     def sensor_fits(self) -> list[SensorFit]:
         """How each accelerometer fits to the others, by the samples so far (or by those that
         :meth:`finish` smoothed); none by the methods ao and sqrt_ao, and before the first."""
         state = self._judged
-        return [] if state is None else sensor_fits(self.names, self.array, state)
+        return [] if state is None else sensor_fits(self.names, self.array, state,
+                                                    self._standing.texts(self.names))
 
     def remarks(self) -> list[str]:
         """What is wrong with the sensors, and what to do, by the samples so far."""
         found = []
-        mounting = self.array.felt[["position_sd", "axes_sd"]].tolist()
+        mounting = self.array.felt[["position_sd", "axes_sd", "scale_sd"]].tolist()
         if self.params.method != "rigid_body" and np.any(mounting):
-            found.append(f"method '{self.params.method}' takes positions and axes as exact: what "
-                         "it states leaves their errors out; use rigid_body, or say that they are "
-                         "(position_sd and axes_sd 0)")
+            found.append(f"method '{self.params.method}' takes positions, axes and scales as "
+                         "exact: what it states leaves their errors out; use rigid_body, or say "
+                         "that they are (position_sd, axes_sd and scale_sd 0)")
         if self._judged is not None:
             found += fit_remarks(self.sensor_fits(), self.array, self._judged)
+        found += [text for text in self._standing.texts(self.names).values() if text not in found]
         found += coarse_remarks(self.names, self.array, self.params, self._limits.steps)
         unit = {"gyroscope": "rad/s"}
         for name, limits in self.limits_found.items():
@@ -133,6 +137,7 @@ class AccelerationFieldEstimator:
         return {"filter": None if self._filter is None else self._filter.get_state(),
                 "start": self._start, "rest": self._rest, "last": self._last, "waits": self._waits,
                 "limits": (self._limits.found.copy(), self._limits.steps.copy()),
+                "standing": self._standing.found.copy(),
                 "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
 
@@ -142,6 +147,7 @@ class AccelerationFieldEstimator:
         self._waits = state["waits"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
         self._limits.found, self._limits.steps = (part.copy() for part in state["limits"])
+        self._standing.found = state["standing"].copy()
         self._late = list(state["late"])
         self._filter = None
         if state["filter"] is not None:
@@ -197,7 +203,8 @@ class AccelerationFieldEstimator:
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
         limits = RangeLimits(self.array)
         limits.mark(readings)    # first what the whole recording tells of them
-        readings = self._channels(limits.mark(readings))
+        standing = StandingAxes(self.array)
+        readings = standing.mark(self._channels(limits.mark(readings)))
         params = self.params
         if params.maximum_likelihood != "off":
             params = fit_densities(params, self.array, self._make_start, stamp, readings)
@@ -205,7 +212,7 @@ class AccelerationFieldEstimator:
         rows, self._smoothed = smooth(params, self.array, self._make_start(params), stamp, readings)
         rows = np.concatenate([*self._late, rows])
         self.reset()
-        self._limits = limits
+        self._limits, self._standing = limits, standing
         return rows
 
     def _check(self, stamp, readings, gyr):
@@ -232,7 +239,7 @@ class AccelerationFieldEstimator:
         if not len(stamp):
             return np.empty(0, ROW)
         self._last = int(stamp[-1])
-        readings = self._channels(self._limits.mark(flat))
+        readings = self._standing.mark(self._channels(self._limits.mark(flat)))
         rows, done = [], 0
         while self._filter is None and done < len(stamp):
             if not self._waits:

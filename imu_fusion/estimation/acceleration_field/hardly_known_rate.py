@@ -28,6 +28,7 @@ from imu_fusion.estimation.acceleration_field.measurement import (
     linearise,
     mounted,
     noise_variance,
+    put_updates,
     scalar_update,
 )
 from imu_fusion.estimation.acceleration_field.motion_model import ACC, ALPHA, OMEGA
@@ -323,8 +324,9 @@ def _take_in(state, precision, pull, trace, n):
             continue
         innovation = reading / told[k] - row[:3] @ state.x[OMEGA:ALPHA]
         slot = first + k
-        trace.total[n, slot] = scalar_update(state.x, state.cov, index, row, 3, innovation,
-                                             1.0 / told[k], trace.column[n, slot],
-                                             len(state.x))
+        column, total = trace.column[n, slot:slot + 1], trace.total[n, slot:slot + 1]
+        scalar_update(state.x, state.cov, index, row, 3, innovation, 1.0 / told[k], column, total,
+                      0, len(state.x))
+        put_updates(state.cov, column, total, len(state.x))
         trace.innovation[n, slot] = innovation
         trace.row[n, slot] = row

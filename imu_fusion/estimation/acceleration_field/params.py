@@ -28,9 +28,13 @@ class Sensor(Parameters):
     acc_axes_sd: float = sensor(
         "acc_axes_sd", 0.035, "Two degrees are what glue and a headform leave; give 0 for a "
         "simulation, less after a calibration.")
+    acc_scale_sd: float = sensor(
+        "acc_scale_sd", 0.01, "A percent is what data sheets leave; give 0 for a simulation, less "
+        "after a calibration.")
     gyro_axes: tuple[float, ...] = sensor(
         "gyro_axes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
     gyro_axes_sd: float = sensor("gyro_axes_sd", 0.035)
+    gyro_scale_sd: float = sensor("gyro_scale_sd", 0.01)
     gyro_noise_density: float = sensor("gyro_noise_density", 1e-3)
     gyro_range: tuple[float, ...] | None = sensor(
         "gyro_range", None, "A rate of this magnitude or more is clipped and not used: the "
@@ -85,12 +89,15 @@ class AccelerometerParams(Parameters):
     axes_sd: float | None = param(
         None, unit="rad", low=0.0, high=0.5,
         doc="Standard deviation of a turn of axes about each of them; unset: sensor.acc_axes_sd.")
+    scale_sd: float | None = param(
+        None, low=0.0, high=0.5,
+        doc="Standard deviation of the scale error of each axis; unset: sensor.acc_scale_sd.")
 
     def completed(self, common: Sensor) -> "AccelerometerParams":
         """With what is unset from the parameters of all."""
         own = {name: getattr(common, f"acc_{name}")
                for name in ("noise_density", "range", "bias_sd", "bias_walk", "position_sd",
-                            "axes_sd")
+                            "axes_sd", "scale_sd")
                if getattr(self, name) is None}
         return self.replace(**own)
 

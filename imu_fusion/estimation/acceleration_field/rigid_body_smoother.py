@@ -67,6 +67,7 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
     """
     p = par[0]
     vector, information = adjoint.vector, adjoint.information
+    chain, chain_dt = np.empty((4, 4)), -1.0
     for n in range(len(trace.x) - 1, -1, -1):
         # With the filtered covariance rather than the predicted one: the difference of two
         # small numbers keeps the digits that a wide prior would cost.
@@ -81,7 +82,9 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
             information[ALPHA:BIAS, :] = 0.0
             information[:, ALPHA:BIAS] = 0.0
         if trace.dt[n] > 0.0:
-            chain, _ = motion_step(trace.dt[n], p.motion.rate)
+            if trace.dt[n] != chain_dt:
+                chain_dt = trace.dt[n]
+                chain, _ = motion_step(chain_dt, p.motion.rate)
             f = transition(trace.dt[n], chain, trace.phi[n])
             multiply_transition_transposed(vector, f)
             multiply_transition_transposed(information, f)
@@ -92,31 +95,56 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
 
 @njit
 def _before_update(adjoint, touched, trace, n):
-    """Take the Adjoint from behind the updates of sample n to before them."""
+    """Take the Adjoint from behind the updates of sample n to before them.
+
+    An update with the row h and the gain g makes (1 - h g') L (1 - g h') + h h' / total of the
+    information L. That is L + h v' + v h' with a vector v; they are added to L all at once.
+    """
     vector, information = adjoint.vector, adjoint.information
-    updates = len(touched)
+    updates, size = len(touched), len(vector)
+    gains, changes = np.zeros((updates, size)), np.zeros((updates, size))
+    for c in range(updates):
+        if trace.total[n, c] != 0.0:
+            gains[c] = trace.column[n, c] / trace.total[n, c]
+    spreads = gains @ information
+    total_change = np.zeros((size, size))
     for k in range(updates):
-        # From the last channel to the first, then the rows of the rate, which came before.
-        c = (updates - RATE_ROWS - 1 - k) % updates
-        total = trace.total[n, c]
-        if total == 0.0:
+        c = _backward(k, updates)
+        if trace.total[n, c] == 0.0:
             continue
-        row, index = trace.row[n, c], touched[c]
-        gain = trace.column[n, c] / total
-        spread = information @ gain
-        quadratic = 1.0 / total + np.dot(gain, spread)
-        pull = trace.innovation[n, c] / total
-        for j in range(len(gain)):
-            pull += gain[j] * vector[j, 0]
-        for k in range(len(row)):
-            i, h = index[k], row[k]
-            vector[i, 0] -= h * pull
-            for j in range(len(gain)):
-                information[i, j] -= h * spread[j]
-                information[j, i] -= h * spread[j]
-        for k in range(len(row)):
-            for j in range(len(row)):
-                information[index[k], index[j]] += row[k] * row[j] * quadratic
+        row, index, gain, spread = trace.row[n, c], touched[c], gains[c], spreads[c]
+        for behind in range(k):
+            _add_change(spread, gain, _backward(behind, updates), touched, trace.row[n], changes)
+        pull = trace.innovation[n, c] / trace.total[n, c] + np.dot(gain, vector.ravel())
+        half = 0.5 / trace.total[n, c] + 0.5 * np.dot(gain, spread)
+        change = changes[c]
+        change[:] = -spread
+        for j in range(len(row)):
+            vector[index[j], 0] -= row[j] * pull
+            change[index[j]] += row[j] * half
+        for j in range(len(row)):
+            total_change[index[j]] += row[j] * change
+    information += total_change + total_change.T
+
+
+@njit
+def _backward(k, updates):
+    """Updates from the last to the first: channels, then the rows of the rate, which came before
+    them."""
+    return (updates - RATE_ROWS - 1 - k) % updates
+
+
+@njit
+def _add_change(spread, gain, c, touched, rows, changes):
+    """Add to L @ gain what the change of L by update c, which is none of an unused one, makes of
+    it, in place."""
+    row, index, change = rows[c], touched[c], changes[c]
+    along, across = np.dot(change, gain), 0.0
+    for k in range(len(row)):
+        across += row[k] * gain[index[k]]
+        spread[index[k]] += row[k] * along
+    for j in range(len(gain)):
+        spread[j] += change[j] * across
 
 
 def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, stamp: np.ndarray,

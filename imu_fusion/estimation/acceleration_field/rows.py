@@ -24,7 +24,7 @@ MISSING = 1      # a channel had no reading
 SATURATED = 2    # a channel was at its range
 GAP = 4          # the time since the previous sample exceeds gap.max
 HELD = 8         # too few channels: carried on without a fit
-LEFT_OUT = 16    # an accelerometer contradicts the others and was not used
+LEFT_OUT = 16    # a sensor contradicts the others or stands still, and was not used
 
 ROW = np.dtype([
     ("stamp", "i8"),

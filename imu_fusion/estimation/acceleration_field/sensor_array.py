@@ -21,21 +21,24 @@ from imu_fusion.estimation.acceleration_field.params import AXIS_NAMES, Accelero
 # Order of the six numbers of the symmetric part: xx yy zz xy xz yz.
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
+# States of mounting in their order, their sd and number: of a sensor, or one of a channel.
+_MOUNTING = (("turn", "axes_sd", 3), ("scale", "scale_sd", 1), ("shift", "position_sd", 3))
+
 # Directions of turning at which an array may tell the angular velocity.
 _TURNINGS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, 1.0, 1.0]])
 
 
 #: One measured axis. ``direction`` (3,) unit vector in body axes; ``lever`` (3,) m from the
 #: reference point; ``density``, ``range``, ``bias_sd``, ``bias_walk`` in units of the sensor;
-#: ``position_sd`` m and ``axes_sd`` rad of its mounting; ``turn`` and ``shift``, the first of the
-#: three states of the error of its axes and of its position, negative if there are none; ``column``
-#: where it stands in a flattened reading, ``sensor`` the number of its accelerometer (the gyroscope
-#: comes last).
+#: ``position_sd`` m, ``axes_sd`` rad and ``scale_sd`` of its mounting; ``turn`` and ``shift``, the
+#: first of the three states of the errors of its sensor's axes and position, and ``scale``, that of
+#: its own scale, negative if there are none; ``column`` where it stands in a flattened reading,
+#: ``sensor`` the number of its accelerometer (the gyroscope comes last).
 CHANNEL = np.dtype([
     ("direction", "f8", 3), ("lever", "f8", 3), ("density", "f8"), ("range", "f8"),
     ("bias_sd", "f8"), ("bias_walk", "f8"), ("position_sd", "f8"), ("axes_sd", "f8"),
-    ("turn", "i8"), ("shift", "i8"), ("column", "i8"), ("sensor", "i8"), ("is_gyro", "?")],
-    align=True)
+    ("scale_sd", "f8"), ("turn", "i8"), ("scale", "i8"), ("shift", "i8"), ("column", "i8"),
+    ("sensor", "i8"), ("is_gyro", "?")], align=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +116,11 @@ class SensorArray:
     def mounting_covariance(self) -> np.ndarray:
         """Covariance (k, k) of the states of mounting, which follow the biases."""
         first = BIAS + len(self.channels)
-        last = max(self.channels["turn"].max(), self.channels["shift"].max())
-        cov = np.zeros((max(last + 3 - first, 0),) * 2)
-        for name, sd in (("turn", "axes_sd"), ("shift", "position_sd")):
+        end = max(int(self.channels[name].max()) + size for name, _, size in _MOUNTING)
+        cov = np.zeros((max(end - first, 0),) * 2)
+        for name, sd, size in _MOUNTING:
             for channel in self.channels[self.channels[name] >= 0]:
-                own = np.arange(3) + channel[name] - first
+                own = np.arange(size) + channel[name] - first
                 cov[own, own] = channel[sd] ** 2
         shifts = np.unique(self.channels["shift"][self.channels["shift"] >= 0]) - first
         for i in range(3):
@@ -125,15 +128,16 @@ class SensorArray:
         return cov
 
     def with_mounting_states(self) -> "SensorArray":
-        """This array with states for the mounting of the sensors that may be off."""
+        """This array with states for what may be off of the mounting of the sensors."""
         channels = self.channels.copy()
         free = BIAS + len(channels)
-        for name, sd in (("turn", "axes_sd"), ("shift", "position_sd")):    # shifts last
-            for number in range(self.accelerometers + 1):
-                own = channels["sensor"] == number
+        for name, sd, size in _MOUNTING:
+            owner = channels["column"] if size == 1 else channels["sensor"]
+            for number in np.unique(owner):
+                own = owner == number
                 if np.any(channels[sd][own] > 0.0):
                     channels[name][own] = free
-                    free += 3
+                    free += size
         return replace(self, channels=channels)
 
     def determines_alpha(self, max_condition: float) -> bool:
@@ -228,6 +232,14 @@ def make_sensor_array(accelerometers: Sequence[AccelerometerParams], common: Sen
                        accelerometers=len(accelerometers))
 
 
+def _channels():
+    """Three CHANNELs without states of their mounting."""
+    channels = np.zeros(3, CHANNEL)
+    for name, _, _ in _MOUNTING:
+        channels[name] = -1
+    return channels
+
+
 def _accelerometer(k, sensor):
     """CHANNELs of the k-th accelerometer, with levers from the body origin."""
     axes = _orthonormal(sensor.axes, f"accelerometer {k}")
@@ -235,25 +247,24 @@ def _accelerometer(k, sensor):
         raise LayoutError(f"accelerometer {k}: measured_axes {list(sensor.measured_axes)} must "
                           "name at least one axis and none twice")
     measured = sorted(AXIS_NAMES.index(a) for a in sensor.measured_axes)
-    channels = np.zeros(3, CHANNEL)
+    channels = _channels()
     channels["direction"], channels["lever"] = axes, sensor.position
     channels["density"], channels["range"] = sensor.noise_density, _limit(sensor.range)
     channels["bias_sd"], channels["bias_walk"] = sensor.bias_sd, sensor.bias_walk
     channels["position_sd"], channels["axes_sd"] = sensor.position_sd, sensor.axes_sd
-    channels["turn"] = channels["shift"] = -1
+    channels["scale_sd"] = sensor.scale_sd
     channels["column"], channels["sensor"] = 3 * k + np.arange(3), k
     return channels[measured]
 
 
 def _gyroscope(first, common):
     """CHANNELs of the gyroscope, whose readings begin at column ``first``."""
-    channels = np.zeros(3, CHANNEL)
+    channels = _channels()
     channels["is_gyro"] = True
     channels["direction"] = _orthonormal(common.gyro_axes, "gyroscope")
     channels["density"], channels["range"] = common.gyro_noise_density, _limit(common.gyro_range)
     channels["bias_sd"], channels["bias_walk"] = common.gyro_bias_sd, common.gyro_bias_walk
-    channels["axes_sd"] = common.gyro_axes_sd
-    channels["turn"] = channels["shift"] = -1
+    channels["axes_sd"], channels["scale_sd"] = common.gyro_axes_sd, common.gyro_scale_sd
     channels["column"], channels["sensor"] = first + np.arange(3), first // 3
     return channels
 

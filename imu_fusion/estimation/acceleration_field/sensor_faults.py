@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
-from imu_fusion.estimation.acceleration_field.motion_model import State
+from imu_fusion.estimation.acceleration_field.motion_model import BIAS, State
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 
@@ -22,7 +22,7 @@ _MOSTLY = 0.5       # of the samples: an impact is wilder than what is before an
 
 
 FIT_UNITS = {"position_error": "m", "position_error_sd": "m", "axes_error": "rad",
-             "axes_error_sd": "rad", "residual": "1"}
+             "axes_error_sd": "rad", "scale_error": "1", "scale_error_sd": "1", "residual": "1"}
 """Units of :meth:`SensorFit.numbers`; what is not named here is a count."""
 
 
@@ -32,7 +32,8 @@ class SensorFit:
 
     ``samples`` were checked, ``left_out`` of them were not used because it contradicted the others;
     ``residual`` rms in units of what noise, bias and mounting allow; ``position_error`` (3,) m and
-    ``axes_error`` (3,) rad, estimates with ``_sd``, body axes; nan where there is no such state.
+    ``axes_error`` (3,) rad, estimates with ``_sd``, body axes, and ``scale_error`` (3,) of its own
+    axes; nan where there is no such state.
     ``fault`` says why it was left out, ``mounting`` in what its mounting is not as described, each
     with what to do; empty where nothing is wrong.
     """
@@ -45,6 +46,8 @@ class SensorFit:
     position_error_sd: np.ndarray
     axes_error: np.ndarray
     axes_error_sd: np.ndarray
+    scale_error: np.ndarray
+    scale_error_sd: np.ndarray
     fault: str = ""
     mounting: tuple[str, ...] = ()
 
@@ -53,26 +56,32 @@ class SensorFit:
         return {"samples": self.samples, "left_out": self.left_out, "residual": self.residual,
                 **{name: [None if np.isnan(v) else float(v) for v in getattr(self, name)]
                    for name in ("position_error", "position_error_sd", "axes_error",
-                                "axes_error_sd")}}
+                                "axes_error_sd", "scale_error", "scale_error_sd")}}
 
 
-def sensor_fits(names: list[str], array: SensorArray, state: State) -> list[SensorFit]:
-    """The SensorFits of an array after the samples that led to ``state``."""
+def sensor_fits(names: list[str], array: SensorArray, state: State,
+                standing: dict[int, str]) -> list[SensorFit]:
+    """The SensorFits of an array after the samples that led to ``state``; ``standing``: texts on
+    those that stand still, by their number."""
     found: list[SensorFit] = []
     for k, name in enumerate(names):
         own = array.channels[array.channels["sensor"] == k]
         check = state.checks[k]
-        shift, shift_sd = _states(state, int(own["shift"][0]))
-        turn, turn_sd = _states(state, int(own["turn"][0]))
+        shift, shift_sd = _states(state, own["shift"][0] + np.arange(3))
+        turn, turn_sd = _states(state, own["turn"][0] + np.arange(3))
+        scale, scale_sd = np.full((2, 3), np.nan)
+        axes = own["column"] % 3
+        scale[axes], scale_sd[axes] = _states(state, own["scale"])
         residual = np.sqrt(check["squares"] / check["channels"]) if check["channels"] else np.nan
-        fault = ""
-        if check["left_out"] >= _SAMPLES:
+        fault = standing.get(k, "")
+        if not fault and check["left_out"] >= _SAMPLES:
             fault = (f"accelerometer '{name}' contradicts the others in {check['left_out']} of "
                      f"{check['checked']} samples and was left out of them: "
                      f"{_cause(name, check, own)}")
         found.append(SensorFit(
             name, int(check["checked"]), int(check["left_out"]), float(residual), shift, shift_sd,
-            turn, turn_sd, fault, () if fault else _mounting(name, own, shift, turn)))
+            turn, turn_sd, scale, scale_sd, fault,
+            () if fault else _mounting(name, own, shift, turn, scale)))
     return found
 
 
@@ -101,6 +110,7 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
                else "")
     remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
     remarks = remarks or _together(fits, array)
+    remarks += _biases(fits, array, state)
     moved = [fit.name for fit in fits if fit.mounting]
     if len(moved) > len(fits) / 2:
         # Of so many, what they have in common is more likely.
@@ -121,8 +131,7 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
         remarks.append(
             f"readings differ from a rigid body by up to {noise:.2g} times their noise, for "
             f"{adaptation['samples'][0]} samples; as much is added to what is stated: look for "
-            "jitter of the stamps, flexing, ringing, clipping or a scale that is off by a percent, "
-            "or raise noise_scale")
+            "jitter of the stamps, flexing, ringing or clipping, or raise noise_scale")
     if adaptation["vague"] > max(_SAMPLES, _SHARE * checked):
         remarks.append(
             f"the angular velocity is hardly known in {adaptation['vague']} of {checked} samples: "
@@ -137,33 +146,53 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
     return remarks
 
 
+def _biases(fits, array, state):
+    """Texts on biases that are far beyond what was said of them."""
+    remarks = []
+    channels = array.channels
+    beyond = (np.abs(state.x[BIAS:BIAS + len(channels)]) > _BEYOND * channels["bias_sd"]) & (
+        channels["bias_sd"] > 0.0) & (channels["bias_walk"] == 0.0)
+    for number in np.unique(channels["sensor"][beyond]):
+        values = state.x[BIAS:BIAS + len(channels)][channels["sensor"] == number]
+        if number == len(fits):
+            remarks.append(
+                f"the gyroscope fits best with biases of {_vector(values, 3)} rad/s: raise "
+                "sensor.gyro_bias_sd; or it turned where it was taken to be still, or its unit, "
+                "axes or sign are wrong")
+        elif not fits[number].fault:
+            name = fits[number].name
+            remarks.append(
+                f"accelerometer '{name}' fits best with biases of {_vector(values, 2)} m/s^2: "
+                f"raise accelerometers.{name}.bias_sd, or calibrate it")
+    return remarks
+
+
 def _together(fits, array):
     """A text on mountings none of which is far off, while all of them together are."""
     squares, number = 0.0, 0
     for k, fit in enumerate(fits):
         own = array.channels[array.channels["sensor"] == k][0]
         for error, sd in ((fit.position_error, own["position_sd"]),
-                          (fit.axes_error, own["axes_sd"])):
-            if np.isfinite(error).all():
-                squares += float(np.sum((error / sd) ** 2))
-                number += 3
+                          (fit.axes_error, own["axes_sd"]), (fit.scale_error, own["scale_sd"])):
+            known = error[np.isfinite(error)]
+            squares += float(np.sum((known / sd) ** 2))
+            number += len(known)
     if number == 0 or squares < scipy.special.chdtri(number, _UNLIKELY):
         return []
-    return ["positions and axes of the accelerometers, taken together, fit best "
+    return ["positions, axes and scales of the accelerometers, taken together, fit best "
             f"{np.sqrt(squares / number):.2g} times as far from what is described as their sds "
-            "say, so what is stated is too small: a sensor whose scale is off by a percent does "
-            "that; calibrate it, or raise sensor.acc_position_sd and sensor.acc_axes_sd"]
+            "say, so what is stated is too small: calibrate them, or raise sensor.acc_position_sd, "
+            "sensor.acc_axes_sd and sensor.acc_scale_sd"]
 
 
-def _states(state, first):
-    """Three states and their standard deviations; nan if there are none."""
-    if first < 0:
-        return np.full(3, np.nan), np.full(3, np.nan)
-    own = slice(first, first + 3)
-    return state.x[own].copy(), np.sqrt(np.diag(state.cov)[own])
+def _states(state, index):
+    """States of numbers ``index`` and their standard deviations; nan if there are none."""
+    if index[0] < 0:
+        return np.full(len(index), np.nan), np.full(len(index), np.nan)
+    return state.x[index], np.sqrt(np.diag(state.cov)[index])
 
 
-def _mounting(name, own, shift, turn):
+def _mounting(name, own, shift, turn, scale):
     """Texts on a mounting that is not as described."""
     remarks = []
     # What the data do not tell stays near zero: an estimate far from it is one.
@@ -178,6 +207,10 @@ def _mounting(name, own, shift, turn):
             f"the body's axes: correct accelerometers.{name}.axes, or raise axes_sd; or its "
             "noise_density or the densities of motion are too small for this motion, and so is "
             "what is stated")
+    if np.any(np.abs(scale) > _BEYOND * own["scale_sd"][0]):
+        remarks.append(
+            f"accelerometer '{name}' fits best with scales that are off by "
+            f"{_vector(100.0 * scale, 1)} %: calibrate it, or raise scale_sd")
     return tuple(remarks)
 
 

@@ -126,21 +126,29 @@ def _still_rows(array, mean, use, size):
     for row, channel in zip(rows, channels):
         if channel["turn"] >= 0 and not channel["is_gyro"]:
             row[channel["turn"]:channel["turn"] + 3] = np.cross(channel["direction"], force)
+        if channel["scale"] >= 0 and not channel["is_gyro"]:
+            row[channel["scale"]] = channel["direction"] @ force
     return rows
 
 
 def is_still(params: AccelerationFieldParams, array: SensorArray, readings: np.ndarray) -> bool:
     """Whether every channel of ``readings`` (n, m) varies by less than ``initial.still_sd``
-    (accelerometers) or ``initial.angular_velocity_sd`` plus noise (gyroscope)."""
+    (accelerometers) or ``initial.angular_velocity_sd`` (gyroscope) beyond its noise, and so do the
+    means of its halves: a slow turn goes under in strong noise, but not in these."""
     channels = array.channels
     seen = np.where(np.isfinite(readings), readings, np.nan)
     use = np.isfinite(seen).sum(axis=0) > 1
     if not np.any(use):
         return False
     noise = params.noise_scale * channels["density"] * np.sqrt(params.sample_rate)
-    limit = np.where(channels["is_gyro"], params.initial.angular_velocity_sd,
-                     params.initial.still_sd) + 2 * noise
-    return bool(np.all(np.nanstd(seen[:, use], axis=0) < limit[use]))
+    still = np.where(channels["is_gyro"], params.initial.angular_velocity_sd,
+                     params.initial.still_sd)
+    if not np.all(np.nanstd(seen[:, use], axis=0) < (still + 2 * noise)[use]):
+        return False
+    first, last = (np.nansum(half, axis=0) / np.maximum(np.isfinite(half).sum(axis=0), 1)
+                   for half in np.array_split(seen[:, use], 2))
+    chance = 4.0 * noise * np.sqrt(4.0 / len(readings))
+    return bool(np.all(np.abs(last - first) < (2 * still + chance)[use]))
 
 
 def normalized(quat: Sequence[float]) -> np.ndarray:

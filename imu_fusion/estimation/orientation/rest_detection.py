@@ -64,7 +64,7 @@ def refuted_turn(s, p):
         return 0.0
     force = rest.mean_force
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
-    if abs(size - s.gravity) > _FORCE_OFF * s.gravity:
+    if abs(size - s.gravity) >= _FORCE_OFF * s.gravity:    # or there is none at all
         rest.settled = 0
         return 0.0
     along = across2 = moved2 = rate2 = changed2 = 0.0

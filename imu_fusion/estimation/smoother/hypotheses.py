@@ -18,21 +18,25 @@ from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
+from imu_fusion.estimation.smoother.whiteness import correlation, wandering
 
 _GAIN = 7.0          # of the log-likelihood: odds of a thousand
 _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
 _SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
 _MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
 def fits(result: SmootherResult) -> bool:
     """Whether innovations of the receiver are white and no larger than they should be. Smaller
-    ones are no reason: what is stated then is too cautious, and not wrong. A magnetometer's are
-    none: iron is no noise."""
+    ones are no reason, if they are white: what is stated then is too cautious, and not wrong. A
+    magnetometer's are none: iron is no noise."""
     return (all(excess == 1.0 for name, excess in result.wander.items() if name != "mag")
+            and not any(len(values) >= _FEWEST and correlation(values)
+                        for name, (_, values) in result.innovations.items() if name != "mag")
             and all(size < _LARGE or len(result.innovations[name][0]) < _FEWEST
                     for name, size in result.misfit().items() if name != "mag"))
 
@@ -53,6 +57,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     found, model = _deep_landing(found, model, smooth)
     if contradicted(found.result):
         return found.result
+    if model.params.maximum_likelihood != "off":
+        found, model = _bent_field(found, model, smooth)
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
     scatter = max(1.0, found.result.misfit().get("fix", 1.0))
     for other in _steps(found.result, model, scatter):
@@ -73,6 +79,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if model.params.get(name) != given[name]:
             found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
+    if model.params.gnss.position_error_sd != tuple(given["gnss.position_error_sd"]):
+        found, model = _no_surer_than_stated(found, model, given, smooth)
     return _adapted(found, model, given)
 
 
@@ -100,6 +108,38 @@ def _deep_landing(found, model, smooth):
     better = is_doubtful(found.result) or (lands and tried.result.surface["landing"].first_excess
                                            < fit.first_excess)
     return (tried, other) if lands and better else (found, model)
+
+
+def _bent_field(found, model, smooth):
+    """With a magnetometer that counts as much less as the field wanders; not compared by
+    likelihood, which has no name for iron.
+
+    Along the field no attitude shows, so what wanders there is the field.
+    """
+    for _ in range(_FIELD_TRIES):
+        excess = _field_wanders(found)
+        if excess == 1.0:
+            break
+        other = model._replace(noise={**model.noise, "mag": excess * model.noise.get("mag", 1.0)})
+        try:
+            found, model = smooth(other), other
+        except EstimationError:
+            break
+    return found, model
+
+
+def _field_wanders(found):
+    """How much more the residuals along the field wander than white noise does."""
+    readings = found.problem.readings
+    mag = readings[readings["kind"] == KINDS["mag"]]
+    if not len(mag):
+        return 1.0
+    left = found.result.residuals["mag"]
+    # Not along what was read: noise has made that longer.
+    field = mag["value"] - np.linalg.solve(mag["whiten"], left[:, :, None])[:, :, 0]
+    field /= np.linalg.norm(field, axis=1, keepdims=True)
+    along = np.sum(left * field, axis=1, keepdims=True)
+    return wandering(mag["stamp"], along)
 
 
 def _delays(found, model):
@@ -132,12 +172,35 @@ def _wandering(found, model, name, error):
         return
     white = float(_MAD * np.median(np.abs(np.diff(left, axis=0))) / np.sqrt(2.0))
     slow = np.sqrt(np.maximum(np.mean(np.square(left), axis=0) - white ** 2, white ** 2))
-    readings = found.problem.readings
-    root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
-    sd = slow * np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
+    sd = slow * _sd_of_readings(found, name)
     for more in (1.0, 3.0):
         for other in _where_zero(model, {f"{error}_sd": tuple((more * sd).tolist())}):
             yield other._replace(noise={**model.noise, name: white * model.noise.get(name, 1.0)})
+
+
+def _no_surer_than_stated(found, model, given, smooth):
+    """With errors of the fixes that are no smaller in all than what the receiver and the parameters
+    state.
+
+    How fast they wander is told by the recording, an offset of all is not: the same variance
+    density, and a longer time.
+    """
+    sd = _sd_of_readings(found, "fix")
+    stated = np.square([sd / model.noise.get("fix", 1.0), given["gnss.position_error_sd"]])
+    gnss = model.params.gnss
+    longer = (stated.sum() - np.sum(sd ** 2)) / np.sum(np.square(gnss.position_error_sd))
+    if longer <= 1.0:
+        return found, model
+    return _try(found, model, model.changed({
+        "gnss.position_error_sd": tuple(np.sqrt(longer) * s for s in gnss.position_error_sd),
+        "gnss.position_error_tau": float(longer) * gnss.position_error_tau}), smooth, -np.inf)
+
+
+def _sd_of_readings(found, name):
+    """Typical standard deviations (k,) of readings, as they count."""
+    readings = found.problem.readings
+    root = np.linalg.inv(readings["whiten"][readings["kind"] == KINDS[name]])
+    return np.median(np.sqrt(np.sum(root ** 2, axis=2)), axis=0)
 
 
 def _where_zero(model, changes):

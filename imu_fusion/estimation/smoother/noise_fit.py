@@ -21,7 +21,7 @@ _SENSOR = ("sensor.gyro_noise_density", "sensor.acc_noise_density", "sensor.gyro
 _MOST = np.log(20.0)   # of a factor, either way
 _SPREAD = 1.0          # of the logarithm of a factor, before any reading: e or 1/e
 _STEP = 0.1            # of it, between two values whose difference tells the slope
-_ENOUGH = 5.0          # of the log-likelihood, of which fits to a drive differ by thousands
+_ENOUGH = 0.5          # of the log-likelihood: less changes no estimate
 _TIMES = 0.5 * np.log(2.0) * np.arange(-3, 9)   # logarithms of factors of a correlation time
 _SLOWEST = 0.25        # of a recording: errors that are slower are an offset that none tells
 _SAMPLES = 60_000      # of the Imu, from the beginning on: ten minutes tell the noise
@@ -96,6 +96,6 @@ def _with(model: Model, factors: NoiseFactors) -> Model:
         sd = np.broadcast_to(model.params.get(f"{parameter}_sd"), 3)
         changes[f"{parameter}_sd"] = tuple((np.sqrt(walk * tau) * sd).tolist())
         changes[f"{parameter}_tau"] = float(tau) * model.params.get(f"{parameter}_tau")
-    return model.changed(changes)._replace(noise={
+    return model.changed(changes)._replace(noise={**model.noise, **{
         name: float(factor) * model.noise.get(name, 1.0)
-        for name, factor in factors.receiver.items()})
+        for name, factor in factors.receiver.items()}})

@@ -255,9 +255,9 @@ class SmootherParams(Parameters):
         "Magnetic Model at the origin and the first stamp. Set it where iron bends the field of "
         "the whole site.")
     maximum_likelihood: str = param(
-        "misfit", choices=("off", "misfit"), doc="misfit: where innovations wander or are larger "
-        "than stated, delays, walks of biases, wandering errors of the receiver and the noise of "
-        "all are fitted to the recording, and a remark names what was taken; off: never.")
+        "misfit", choices=("off", "misfit"), doc="misfit: where innovations are not white or "
+        "larger than stated, delays, walks of biases, wandering errors of the receiver and the "
+        "noise of all are fitted to the recording, and a remark names what was taken; off: never.")
     sensor: Sensor = Sensor()
     gap: Gap = Gap()
     gnss: Gnss = Gnss()

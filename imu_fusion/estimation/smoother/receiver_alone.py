@@ -107,8 +107,8 @@ def _stamps(fixes: np.ndarray) -> np.ndarray:
 
 def _stated_sd(cov: np.ndarray, given: tuple[float, ...], params: SmootherParams
                ) -> tuple[float, ...]:
-    """Typical standard deviations (3,) east, north, up, of covariances (n, 3, 3), or those given where
-    they are not stated."""
+    """Typical standard deviations (3,) east, north, up, of covariances (n, 3, 3), or those given
+    where they are not stated."""
     variance = cov.diagonal(0, 1, 2)
     variance = variance[(variance > 0.0).all(axis=1)]
     if not params.gnss.covariances or not len(variance):
@@ -117,8 +117,8 @@ def _stated_sd(cov: np.ndarray, given: tuple[float, ...], params: SmootherParams
 
 
 def _likeliest_density(problem: Problem, params: SmootherParams) -> float:
-    """Density (m/s^2/sqrt(Hz)) of the acceleration, to a factor of two, under which the readings are
-    likeliest."""
+    """Density (m/s^2/sqrt(Hz)) of the acceleration, to a factor of two, under which the readings
+    are likeliest."""
     # The problem is linear: wherever it was solved, this is the likelihood.
     def likelihood(factor: float) -> float:
         return problem.log_likelihood(NoiseFactors((1.0, factor), (1.0, 1.0), {}, {}),

@@ -100,12 +100,14 @@ def _on_adapted(result):
         taken = [f"{name}: {_short(value)}" for name, value in adapted.items()]
         taken += [f"{factor:.2g} times the stated standard deviations of {name}"
                   for name, factor in result.noise.items()]
-        yield ("with the noise as given the innovations wander or are larger than stated; "
-               "far likelier, and taken, is " + ", ".join(taken) + ". Put it into the parameters "
+        yield ("with the noise as given the innovations are not white, or larger than stated; "
+               "taken instead is " + ", ".join(taken) + ". Put it into the parameters "
                "to keep it (maximum_likelihood: off keeps those given)")
 
 
 def _short(value):
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_short, value))}]"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 

@@ -26,12 +26,13 @@ from imu_fusion.simulation.rigid_body_impact import (
 GIVEN = AccelerationFieldParams(
     initial=Initial(mode="given", angular_velocity=(5.0, 5.0, 5.0), angular_velocity_sd=1e-6),
     gravity=9.8)
+EXACT = {"position_sd": 0.0, "axes_sd": 0.0, "scale_sd": 0.0}
 METHODS = [{"method": "ao"}, {"method": "sqrt_ao"}, {"method": "rigid_body"},
            {"method": "rigid_body", "mode": "smoothed"}]
 
 
 def sensors(positions=PAPER_POSITIONS, axes=PAPER_AXES, **common):
-    common = {"noise_density": 1e-6, "bias_sd": 0.0, "position_sd": 0.0, "axes_sd": 0.0, **common}
+    common = {"noise_density": 1e-6, "bias_sd": 0.0, **EXACT, **common}
     return [AccelerometerParams(position=tuple(p), axes=tuple(np.ravel(a)), **common)
             for p, a in zip(positions, axes)]
 
@@ -101,7 +102,7 @@ def test_gradient_worked_by_hand():
 def _some_axes(positions, measured, axes=None):
     axes = [np.eye(3)] * len(positions) if axes is None else axes
     return [AccelerometerParams(position=tuple(p), axes=tuple(np.ravel(a)), measured_axes=m,
-                                noise_density=1e-6, bias_sd=0.0, position_sd=0.0, axes_sd=0.0)
+                                noise_density=1e-6, bias_sd=0.0, **EXACT)
             for p, m, a in zip(positions, measured, axes)]
 
 
@@ -124,7 +125,7 @@ def _layouts():
         "six bi-axial": _some_axes(spread[:6], [("x", "y"), ("y", "z"), ("x", "z")] * 2, turned),
         "twelve uni-axial": _some_axes(spread, [("x",)] * 12, turned),
         "nine-accelerometer package": _nine_accelerometer_package(
-            0.1, noise_density=1e-6, bias_sd=0.0, position_sd=0.0, axes_sd=0.0),
+            0.1, noise_density=1e-6, bias_sd=0.0, **EXACT),
     }
 
 
@@ -297,6 +298,19 @@ def test_rest_finds_tilt_and_biases(motion):
     variance = np.linalg.eigvalsh(rows["cov_attitude"][0])
     assert abs(variance[0]) < 1e-12  # the heading is given
     assert np.sqrt(variance[1:]) == pytest.approx([0.0102, 0.0102], rel=0.05)
+
+
+def test_strong_noise_does_not_hide_that_a_body_turns():
+    # 1.7 rad/s about a level axis, then still: noise of 2 m/s^2 is more than what that changes.
+    t = np.arange(800) / 62.5
+    angle = 1.7 * np.minimum(t, 6.0)
+    felt = 9.80665 * np.column_stack([0.0 * t, np.sin(angle), np.cos(angle)])
+    readings = np.einsum("kij,nj->nki", PAPER_AXES, felt)
+    readings += np.random.default_rng(0).normal(0.0, 2.0, readings.shape)
+    params = AccelerationFieldParams(sample_rate=62.5, initial=Initial(duration=2.0))
+    rows = AccelerationFieldEstimator(params, sensors(noise_density=2.0 / 62.5 ** 0.5)).run(
+        np.round(t * 1e9).astype(np.int64), readings)
+    assert 5.0 < rows["stamp"][0] * 1e-9 < 7.0
 
 
 def test_rest_waits_until_the_body_is_still(motion):

@@ -95,6 +95,8 @@ def rows(motion, change, **parameters):
     ({"sensor.acc_range": [30.0]}, {}),
     ({"sensor.gyro_axes": [0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]}, GYRO),
     ({"sensor.gyro_bias_sd": 0.5}, GYRO),
+    ({"sensor.acc_scale_sd": 0.1}, {}),
+    ({"sensor.gyro_scale_sd": 0.1}, GYRO),
     ({"sensor.gyro_bias_walk": 0.1}, GYRO),
     ({"sensor.gyro_noise_density": 2e-3}, GYRO),
     ({"initial.orientation": [0.0, 0.0, 1.0, 0.0]}, {}),

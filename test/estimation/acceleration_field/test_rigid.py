@@ -46,10 +46,10 @@ IMPACT = PARAMS.replace(
 
 
 def sensors(noise_density=1e-2, bias_sd=0.3, reports="specific_force", bias_walk=0.0,
-            position_sd=0.0, axes_sd=0.0):
+            position_sd=0.0, axes_sd=0.0, scale_sd=0.0):
     return [AccelerometerParams(position=tuple(p), axes=tuple(a.ravel()), reports=reports,
                                 noise_density=noise_density, bias_sd=bias_sd, bias_walk=bias_walk,
-                                position_sd=position_sd, axes_sd=axes_sd)
+                                position_sd=position_sd, axes_sd=axes_sd, scale_sd=scale_sd)
             for p, a in zip(PAPER_POSITIONS, PAPER_AXES)]
 
 
@@ -159,7 +159,8 @@ def _normalised_errors(params, realisations, samples, seed, **mounting):
 
 
 @pytest.mark.parametrize("mode", ["causal", "smoothed"])
-@pytest.mark.parametrize("mounting", [{}, {"position_sd": 1e-3, "axes_sd": 0.035}])
+@pytest.mark.parametrize("mounting", [{}, {"position_sd": 1e-3, "axes_sd": 0.035,
+                                           "scale_sd": 0.01}])
 def test_uncertainty_is_honest(mode, mounting):
     realisations = 60
     params = PARAMS.replace(mode=mode)
@@ -221,7 +222,7 @@ def test_clipped_gyroscope_is_filled_in_by_the_accelerometers(impact):
     params = IMPACT.replace(**{
         "mode": "smoothed", "initial.angular_velocity_sd": 0.1, "use_gyro": True,
         "sensor.gyro_noise_density": 3e-4, "sensor.gyro_range": (limit,),
-        "sensor.gyro_axes_sd": 0.0})
+        "sensor.gyro_axes_sd": 0.0, "sensor.gyro_scale_sd": 0.0})
     rows = AccelerationFieldEstimator(params, sensors(1e-2, 0.1)).run(
         impact.stamp, readings, np.clip(gyr, -limit, limit))
     assert np.array_equal(rows["flags"] & SATURATED > 0, clipped.any(axis=1))
@@ -339,7 +340,7 @@ def test_a_body_that_hardly_turns_says_nothing_of_the_mounting():
     """Noise must not pass for motion: at rest no reading tells how the sensors sit as a whole."""
     params = AccelerationFieldParams(initial=Initial(mode="rest", duration=0.2))
     estimator = AccelerationFieldEstimator(params, sensors(noise_density=3e-3, position_sd=1e-3,
-                                                           axes_sd=0.035))
+                                                           axes_sd=0.035, scale_sd=0.01))
     up = np.einsum("kij,j->ki", PAPER_AXES, [0.0, 0.0, 9.80665])
     readings = up + np.random.default_rng(3).normal(0, 0.1, (1500, 4, 3))
     estimator.run(np.arange(1500, dtype=np.int64) * 1_000_000, readings)

@@ -94,3 +94,13 @@ def test_a_circle_is_no_rest(leans):
     rows = estimator.run(imu)
     assert estimator.summary()["realigned"] == 0
     assert not (rows["flags"][imu.stamp > int(10e9)] & FLAG_STILL).any()
+
+
+def test_a_body_that_feels_no_force_refutes_nothing():
+    """Steady rates and forces, as at rest, but no gravity: an array that spins."""
+    n = 200
+    imu = ImuLog(10_000_000 * np.arange(n), gyr=np.tile([0.0, 0.0, 5.0], (n, 1)),
+                 acc=np.zeros((n, 3)))
+    estimator = make({})
+    assert len(estimator.run(imu)) == n
+    assert estimator.summary()["realigned"] == 0

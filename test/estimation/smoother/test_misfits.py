@@ -7,10 +7,15 @@ import pytest
 
 from benchmarks.smoother_speed import FRAME, drive
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.whiteness import correlation, wandering
+from imu_fusion.evaluation.consistency import nees
 from imu_fusion.messages import convert
 from imu_fusion.messages.layouts import FIX
 from imu_fusion.samples.checks import check_fix
 from imu_fusion.samples.logs import FixLog
+from imu_fusion.simulation import walk as walking
+from imu_fusion.simulation.noise import gauss_markov
+from imu_fusion.simulation.noise_gnss import GnssErrors
 
 PARAMS = SmootherParams(gravity=9.8)
 
@@ -128,3 +133,60 @@ def test_errors_that_wander_are_no_delay_in_the_end(logs, monkeypatch):
         imu, mag, FixLog(fix.stamp, *FRAME.to_geodetic(enu), stated, fix.status), velocity)
     assert "gnss.position_error_sd" in result.adapted
     assert not any("time_offset" in name for name in result.adapted)
+
+
+def test_correlation_does_not_depend_on_what_is_stated():
+    rng = np.random.default_rng(1)
+    white = [correlation(rng.standard_normal((150, 3))) for _ in range(200)]
+    assert np.count_nonzero(white) < 4    # a thousandth of 600 components
+    slow = gauss_markov((150, 3), 1.0, 10.0, 1.0, rng)
+    assert correlation(slow) == pytest.approx(np.exp(-0.1), abs=0.15)
+    assert correlation(0.3 * slow) == pytest.approx(correlation(slow))
+    assert correlation(0.01 * slow) == 0.0    # less than the mean of 150 is sure: .08
+
+
+def test_errors_of_a_minute_show_in_means_over_longer_times():
+    rng = np.random.default_rng(2)
+    stamp = np.arange(600) * 10**9
+    white = rng.standard_normal((600, 3))
+    assert wandering(stamp, white) == 1.0
+    # .3 over a minute: a twentieth in the variance of means over 5 s, half of those over 80 s.
+    assert wandering(stamp, white + 0.3 * gauss_markov((600, 3), 1.0, 60.0, 1.0, rng)) > 2.0
+
+
+def walked(seconds, errors, seed):
+    """A walk, and result and truth (n, 3) m, less what lies in ``outage`` s."""
+    walk = walking.Walk(seconds, np.random.default_rng([seed, 3]))
+    recorded = walking.record(walk, np.random.default_rng([seed, 4]), errors)
+
+    def run(outage=(0.0, 0.0)):
+        t = (recorded.fix.stamp - recorded.imu.stamp[0]) * 1e-9
+        kept = (t < outage[0]) | (t >= outage[1])
+        result = Smoother(SmootherParams()).run(recorded.imu, recorded.mag, recorded.fix[kept],
+                                                recorded.velocity[kept])
+        since = (result.samples["stamp"] - recorded.imu.stamp[0]) * 1e-9
+        truth = result.frame.to_enu(*walking.FRAME.to_geodetic(walk.position(since)))
+        return result, result.samples["position_world"] - truth, since
+    return run
+
+
+def test_a_magnetometer_past_iron_counts_less():
+    """As sure as stated, it draws the position 9 m away while there are no fixes."""
+    outage = 30.0, 45.0
+    result, error, t = walked(60.0, walking.WalkErrors(iron=8e-6), 0)(outage)
+    inside = (t > outage[0]) & (t < outage[1])
+    assert result.noise["mag"] > 5.0 and any("of mag" in remark for remark in result.remarks())
+    assert np.linalg.norm(error[inside], axis=1).max() < 0.5
+    assert nees(error[inside], result.samples["cov_position"][inside]).mean() < 6.0
+
+
+def test_fixes_that_are_small_and_alike_are_not_averaged_away():
+    """A receiver that states 4 m and errs by 3 m the same way for half a minute: innovations are
+    small, and the mean of a hundred fixes would be sure to .4 m."""
+    errors = walking.WalkErrors(gnss_rate=1.0, stated_sd=(4.0, 4.0, 6.0), gnss=GnssErrors(
+        position_sd=(3.0, 3.0, 6.0), position_tau=30.0, correlated_share=0.97,
+        velocity_sd=(0.3, 0.3, 0.3)))
+    result, error, _ = walked(100.0, errors, 1)()
+    assert "gnss.position_error_sd" in result.adapted
+    # One error of each axis for minutes: NEES of three numbers, below 16.3 in 999 of 1000.
+    assert nees(error, result.samples["cov_position"]).mean() < 16.3
