@@ -40,7 +40,7 @@ def main(count=SEEDS):
             avalanche = Avalanche(rng=np.random.default_rng([seed, 0]))
             log = record_ball(avalanche, np.random.default_rng([seed, 1]), gnss=AVANODE,
                               gnss_rate=10.0, outages=outages)
-            for (name, scores), params in zip(found.items(), ({}, STATED)):
+            for scores, params in zip(found.values(), ({}, STATED)):
                 scores.append(score(avalanche, log, params))
         for name, scores in found.items():
             s = np.array(scores)

@@ -43,7 +43,7 @@ _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that
 
 
 class Given(NamedTuple):
-    """Arguments of :meth:`.smoother.Smoother.run`."""
+    """Arguments of :meth:`.smoother.Smoother.run`; ``felt``: whether an Imu felt the motion."""
 
     imu: ImuLog
     mag: MagLog | None
@@ -51,6 +51,7 @@ class Given(NamedTuple):
     velocity: VelocityLog | None
     events: JumpEvents | None
     initial_quat: np.ndarray | None
+    felt: bool = True
 
     def earlier(self, lag: float) -> "Given":
         """With stamps of the receiver that are earlier by a lag (s)."""
@@ -100,7 +101,7 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
     around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
     problem = Problem(prepared, params, readings, around, constraints,
-                      StatePrior.of(params, measured))
+                      StatePrior.of(params, measured), given.felt)
     hill = surface if isinstance(surface, Hill) and events is not None else None
     start = None if params.initial.position is None else frame.to_enu(*first)
     judge = "fix" if "fix" in measured else "mag"
@@ -187,7 +188,9 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],
                                              fit["innovation"][:, :width])
             residuals[measurement.name] = fit["residual"][:, :width]
-    wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
+    # Innovations of velocities wander with accelerations that nobody felt.
+    wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()
+              if problem.felt or name != "velocity"}
     fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params,
                         problem.free[problem.imu.recorded])
     # A jump's landing makes its length less certain; other surfaces make all.

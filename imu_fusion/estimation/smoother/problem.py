@@ -106,11 +106,13 @@ class Problem:
         around: Surroundings.
         constraints: of the surface.
         prior: StatePrior, whose mean may be completed before the first step.
+        felt: whether an Imu felt the motion.
     """
 
     def __init__(self, imu: ImuInput, params: SmootherParams, readings: np.ndarray,
-                 around: Surroundings, constraints: Sequence[Constraint], prior: StatePrior):
-        self.imu, self.params, self.around = imu, params, around
+                 around: Surroundings, constraints: Sequence[Constraint], prior: StatePrior,
+                 felt: bool = True):
+        self.imu, self.params, self.around, self.felt = imu, params, around, felt
         self.constraints, self.prior = tuple(constraints), prior
         self.mean, self.prior_sd = prior.mean.copy(), prior.sd
         self.blocks, self.size = prior.blocks, len(prior.sd)

@@ -71,7 +71,7 @@ def smooth_receiver(fix: FixLog | None, velocity: VelocityLog | None, params: Sm
     around = surroundings_of(params, frame, int(stamp[0]), False)
     still = ImuLog(stamp, np.tile(around.earth_rate, (len(stamp), 1)),
                    np.tile([0.0, 0.0, around.gravity], (len(stamp), 1)))
-    given = Given(still, None, fix, velocity, None, _UPRIGHT)
+    given = Given(still, None, fix, velocity, None, _UPRIGHT, felt=False)
     changes: dict[str, Any] = {**_IMU, _ACC_DENSITY: params.gap.acc_noise_density}
     gnss = params.gnss
     if not np.any(gnss.position_error_sd):
