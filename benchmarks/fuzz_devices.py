@@ -10,11 +10,11 @@ import numpy as np
 from imu_fusion.errors import SampleError
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.inspect import inspect_topics
-from imu_fusion.sources.phyphox import PhyphoxLive
+from imu_fusion.sources.phyphox_live import PhyphoxLive
 from imu_fusion.sources.sensor_logger import SensorLoggerPush
+from test.sources.exports import Server, batches, export, poll, sensor_logger, zipped
 from test.sources.logs import ulog
 from test.sources.test_exports import AVANODE_GNSS, AVANODE_IMU, LOCATION
-from test.sources.test_formats import Server, batches, export, poll, sensor_logger, zipped
 from test.sources.test_splitting import STREAMS
 
 Files = Mapping[str, bytes]

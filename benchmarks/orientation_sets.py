@@ -252,7 +252,7 @@ def score(r, quat, cov=None):
         return Score(total, inclination, heading)
     turn = estimate.as_matrix()
     world = turn @ cov[keep] @ turn.transpose(0, 2, 1)
-    vector = error.as_rotvec()
+    vector = _tilt_and_heading(error)
     cause = _cause(vector, (r.imu.stamp[keep] - r.imu.stamp[0]) * 1e-9)
     distance = (vector * np.linalg.solve(world, vector[..., None])[..., 0]).sum(axis=1)
     tilt = np.degrees(np.sqrt((world[:, 0, 0] + world[:, 1, 1]).mean()))
@@ -261,6 +261,16 @@ def score(r, quat, cov=None):
                  tilt / inclination,
                  np.nan if r.mag is None or r.frames == "tilt" else yaw / heading,
                  cause)
+
+
+def _tilt_and_heading(error):
+    """Errors (n,) Rotation in world axes as (n, 3) rad: of the vertical, and the turn about it,
+    which may be any where there is no heading."""
+    quat = error.as_quat()
+    heading = Rotation.from_quat(quat * [0.0, 0.0, 1.0, 1.0])
+    vector = (error * heading.inv()).as_rotvec()
+    vector[:, 2] = heading.as_rotvec()[:, 2]
+    return vector
 
 
 def _cause(error, seconds):

@@ -33,22 +33,34 @@ class Case:
     """A kind of recordings: a motion for each seed, and what is off.
 
     place: standard deviation per axis of the field of places, 1 m apart, relative to its norm;
-    current: the same of a magnet that comes and goes with a current, in imu axes; bias: of the
-    gyroscope, rad/s, scale: of each of its axes; cut: start in motion.
+    current: the same of a magnet that comes and goes with a current, in imu axes, iron: of one that
+    stays there; bias: of the gyroscope, rad/s, scale: of each of its axes, limit: rad/s, at which
+    it clips; acc_bias: m/s^2; cut: start in motion.
     """
 
     motion: object
     magnetometer: bool = True
     place: float = 0.0
     current: float = 0.0
+    iron: float = 0.01
     bias: float = 0.01
     scale: float = 0.0
+    limit: float = math.inf
+    acc_bias: float = 0.03
     cut: bool = False
     duration: float = 63.0
 
 
 def _tumbling(seed):
     return Tumbling(seed=seed, rate_sd=1.5, rest=_REST)
+
+
+def _stick(seed):
+    return Tumbling(seed=seed, rate_sd=4.0, rest=_REST)
+
+
+def _arm(seed):
+    return Tumbling(seed=seed, rate_sd=0.4, frequencies=(0.03, 0.3), travel_sd=0.3, rest=_REST)
 
 
 def _circles(leans, seed):
@@ -74,10 +86,22 @@ CASES = {
     "level circles, no magnetometer": Case(_cart, magnetometer=False, duration=90.0),
     "level circles, start in motion, no magnetometer": Case(_cart, magnetometer=False, cut=True,
                                                             duration=90.0),
+    "leaning circles, start in motion, no magnetometer": Case(_scooter, magnetometer=False, cut=True,
+                                                              duration=90.0),
+    "robot arm, no magnetometer": Case(_arm, magnetometer=False),
+    "robot arm, start in motion, no magnetometer": Case(_arm, magnetometer=False, cut=True),
+    "stick, clipped at 8 rad/s": Case(_stick, limit=8.0),
+    "stick, clipped at 8 rad/s, start in motion": Case(_stick, limit=8.0, cut=True),
+    "magnet in the case, 15 %": Case(_tumbling, iron=0.15),
+    "magnet in the case, 15 %, start in motion": Case(_tumbling, iron=0.15, cut=True),
     "magnet that comes with a current": Case(_tumbling, current=0.15),
     "gyroscope's scale off by 4 to 8 %, no magnetometer": Case(_tumbling, magnetometer=False,
                                                                scale=0.06),
+    "gyroscope's scale off by 4 to 8 %, start in motion, no magnetometer": Case(
+        _tumbling, magnetometer=False, scale=0.06, cut=True),
     "bias of 3 deg/s per axis, start in motion": Case(_tumbling, bias=0.05, cut=True),
+    "accelerometer off by 0.2 m/s^2 per axis, no magnetometer": Case(_tumbling, magnetometer=False,
+                                                                     acc_bias=0.2),
 }
 
 
@@ -96,8 +120,9 @@ def record(name, case, seed):
         case.scale * rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3))
     sensors = Sensors(
         gyr_density=3e-4, acc_density=2e-3, mag_sd=4e-7, gyr_walk=2e-5, gyr_matrix=matrix,
-        gyr_bias=tuple(rng.normal(0, case.bias, 3)), acc_bias=tuple(rng.normal(0, 0.03, 3)),
-        mag_offset=tuple(rng.normal(0, 5e-7, 3)))
+        gyr_bias=tuple(rng.normal(0, case.bias, 3)), gyr_limit=case.limit,
+        acc_bias=tuple(rng.normal(0, case.acc_bias, 3)),
+        mag_offset=tuple(rng.normal(0, case.iron * _NORM, 3)))
     motion: Motion = case.motion(seed)
     imu, mag, truth, _ = simulate(motion, case.duration, rate=_RATE, sensors=sensors, seed=seed,
                                   field_world=earth_field(_NORM, math.radians(65)))

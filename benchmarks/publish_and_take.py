@@ -14,7 +14,8 @@ from rclpy.duration import Duration
 from sensor_msgs.msg import Imu, MagneticField
 
 from imu_fusion.messages.convert import imu_message, mag_message
-from imu_fusion.nodes.base import use_fast_heartbeats
+from imu_fusion.nodes.base import LEAVING, use_fast_heartbeats
+from imu_fusion.nodes.ending import ends_within
 from imu_fusion.nodes.flow.qos import reliable_qos, session_qos
 from imu_fusion.nodes.flow.source import WINDOW
 
@@ -24,14 +25,12 @@ MADE = {Imu: imu_message(0, "imu_link", (0, 0, 0), (0, 0, 9.8)),
         MagneticField: mag_message(0, "imu_link", (0, 0, 0))}
 
 
-def publish(outs, count):
-    """So many on each, as fast as they are acknowledged."""
-    for i in range(count):
-        for publisher in outs:
-            publisher.publish(MADE[publisher.msg_type])
-        if i % WINDOW == WINDOW - 1:
-            while not all(p.wait_for_all_acked(Duration(nanoseconds=0)) for p in outs):
-                time.sleep(NAP)
+def publish(publisher, sent):
+    """One more after so many, as fast as they are acknowledged."""
+    publisher.publish(MADE[publisher.msg_type])
+    if sent % WINDOW == WINDOW - 1:
+        while not publisher.wait_for_all_acked(Duration(nanoseconds=0)):
+            time.sleep(NAP)
 
 
 def main(role, count):
@@ -50,7 +49,9 @@ def main(role, count):
     if role == "first":
         # The last one sees the middle one a little later than we do.
         time.sleep(2.0)
-        publish(outs, count)
+        for i in range(count):
+            for publisher in outs:
+                publish(publisher, i)
     left = {id(s): count for s in ins}
     while any(left.values()):
         taken = 0
@@ -58,14 +59,15 @@ def main(role, count):
             with s.handle:
                 while s.handle.take_message(s.msg_type, True) is not None:
                     taken += 1
-                    left[id(s)] -= 1
                     if outs and s is ins[0]:
-                        outs[0].publish(MADE[Imu])
+                        publish(outs[0], count - left[id(s)])
+                    left[id(s)] -= 1
         if not taken:
             time.sleep(NAP)
     for p in outs:
         p.wait_for_all_acked(Duration(seconds=60))
-    node.destroy_node()
+    with ends_within(LEAVING, 0):
+        node.destroy_node()
     rclpy.try_shutdown()
 
 

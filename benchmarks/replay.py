@@ -7,13 +7,14 @@ system), as the difference of two durations: neither their start nor other work 
 counts.
 """
 
+import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ from benchmarks.recording_of_all import write_parameters, write_recording
 from benchmarks.table import RESULTS
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.convert import imu_message, mag_message
-from imu_fusion.messages.layouts import IMU
+from imu_fusion.messages.layouts import ACCEL, IMU, VECTOR3
+from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
@@ -41,6 +43,16 @@ TOPICS = ("imu/data_raw", "imu/mag", "imu/data")
 AT_RATE_ZERO = ("replayer", "orientation_estimator", "recorder")
 BOUND = ("first", "middle", "last")
 ALL = ("orientation_estimator", "acceleration_field_estimator", "smoother")
+MAG = "sensor_msgs/msg/MagneticField"
+# What these take and publish with each sample of the topic that they answer, which stands last.
+BARE = {"orientation_estimator": ({"imu/mag": MAG, "imu/data_raw": IMU.msgtype},
+                                  {"imu/data": IMU.msgtype, "imu/rpy/filtered": VECTOR3.msgtype}),
+        "acceleration_field_estimator": (
+            {"imu/data_raw": IMU.msgtype} | {f"accelerometers/{name}": IMU.msgtype
+                                             for name in ("top", "left", "front", "back")},
+            {"acceleration_field/imu": IMU.msgtype, "acceleration_field/accel": ACCEL.msgtype,
+             "acceleration_field/points": POINT_CLOUD_TYPE}),
+        "smoother": ({"imu/mag": MAG, "imu/data_raw": IMU.msgtype}, {})}
 DRIVER = """
 import sys, time
 import rclpy
@@ -186,19 +198,36 @@ def published(path):
     return found
 
 
+@contextmanager
+def beside(nodes, *arguments):
+    """A process of Python in the domain of the nodes."""
+    process = subprocess.Popen([sys.executable, *arguments], cwd=HERE, env=os.environ | {
+        "PYTHONPATH": str(HERE), "ROS_DOMAIN_ID": str(nodes.domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
 def live_once(checkout, bag, nodes_there, folder):
-    """A driver in real time: ({node: share of a core}, {output: its delays, ms})."""
+    """A driver in real time: ({node: share of a core}, {output: its delays, ms}); of bare nodes in
+    their place if there is no checkout."""
     with tempfile.TemporaryDirectory(dir=folder) as own, nodes_of(
-            checkout, Path(own) / "logs") as nodes:
-        preset = Path(own) / "parameters.yaml"
-        write_parameters(preset, checkout / "config")
+            checkout or HERE, Path(own) / "logs") as nodes, ExitStack() as held:
         nodes.start("recorder", out=f"{own}/out")
+        there = {}
         for node in nodes_there:
-            nodes.start(node, params_file=preset, qos="reliable")
-        driver = subprocess.Popen(
-            [sys.executable, "-c", DRIVER, str(bag)], cwd=HERE, env=os.environ | {
-                "PYTHONPATH": str(HERE), "ROS_DOMAIN_ID": str(nodes.domain),
-                "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+            if checkout is None:
+                there[node] = held.enter_context(beside(
+                    nodes, "-m", "benchmarks.bare_node", *map(json.dumps, BARE[node])))
+            else:
+                preset = Path(own) / "parameters.yaml"
+                write_parameters(preset, checkout / "config")
+                nodes.start(node, params_file=preset, qos="reliable")
+                there[node] = nodes.process(node)
+        driver = held.enter_context(beside(nodes, "-c", DRIVER, str(bag)))
         recorded = Path(own) / "out" / "out_0.mcap"
         while not recorded.exists() or recorded.stat().st_size < 500_000:
             time.sleep(0.1)
@@ -206,10 +235,10 @@ def live_once(checkout, bag, nodes_there, folder):
                 raise SystemExit("nothing was recorded")
         time.sleep(3.0)
         began = time.monotonic()
-        before = {n: cpu_seconds(nodes.process(n)) for n in nodes_there}
+        before = {n: cpu_seconds(process) for n, process in there.items()}
         time.sleep(15.0)
         took = time.monotonic() - began
-        share = {n: (cpu_seconds(nodes.process(n)) - before[n]) / took for n in nodes_there}
+        share = {n: (cpu_seconds(process) - before[n]) / took for n, process in there.items()}
         driver.wait(120)
         nodes.process("recorder").send_signal(2)
         nodes.process("recorder").wait(60)
@@ -218,7 +247,7 @@ def live_once(checkout, bag, nodes_there, folder):
     for output, source in (("/imu/data", "/imu/data_raw"),
                            ("/acceleration_field/imu", "/accelerometers/back")):
         made, came = times.get(output, {}), times.get(source, {})
-        if made:
+        if made and checkout is not None:
             begin = min(made) + STARTED
             delays[output] = [(made[s] - came[s]) * 1e-6 for s in made if s in came and s > begin]
     return share, delays
@@ -262,10 +291,11 @@ def live(checkouts, runs, folder):
     write_recording(folder / "all", write_parameters(folder / "p.yaml"), LIVE)
     lines = ["| live | | CPU, % of a core: median | together | delay of imu/data ms: p50, p99 | of "
              "acceleration_field/imu | load |", "|---|---|---|---|---|---|---|"]
+    compared = checkouts | {"plain rclpy, no work": None}
     for bag, nodes in (("orientation", ALL[:1]), ("all", ALL)):
-        found = {name: [] for name in checkouts}
+        found = {name: [] for name in compared}
         for _ in range(runs):
-            for name, checkout in checkouts.items():
+            for name, checkout in compared.items():
                 found[name].append((*live_once(checkout, folder / bag, nodes, folder),
                                     os.getloadavg()[0]))
                 print(bag, name, found[name][-1][0], flush=True)

@@ -84,12 +84,13 @@ COMPUTING_OF_FILES = {
     "surfaces/elevation_grid.py": {"pyproj", "rasterio"},    # a terrain is a file
     # Formats take bytes that others have read, and some know a library for what is in them.
     **{f"sources/{name}.py": extra for name, extra in {
-        "source": {"re"}, "table": {"csv", "decimal"}, "times": {"decimal", "re"}, "header": {"re"},
-        "sketch": {"re"}, "table_layout": {"re"}, "table_time": {"re"},
+        "source": {"re"}, "table_reader": {"csv", "decimal"}, "times": {"decimal", "re"},
+        "header": {"re"}, "sketch": {"re"}, "table_layout": {"re"}, "table_time": {"re"},
         "registry": {"pathlib", "re"}, "avanode": {"re"},
         "sensor_logger": {"csv", "json", "pathlib"}, "ximu3": {"pathlib", "struct"},
         "ulog": {"io", "pyulog"},
-        "phyphox": {"io", "json", "pathlib", "python_calamine", "re", "urllib", "zipfile"},
+        "phyphox": {"io", "pathlib", "python_calamine", "re", "zipfile"},
+        "phyphox_live": {"json", "urllib"},
         "gnss": {"pynmeagps", "pyubx2", "re"}, "gpx": {"xml"}}.items()},
     "kernels.py": {"hashlib", "os", "pathlib", "pickle", "re", "shutil", "sys", "tempfile", "time"},
 }

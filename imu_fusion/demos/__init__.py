@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 DEMOS = {
     "orientation": "a sensor turned by hand, against an optical reference",
     "impact": "eight accelerometers recover what a clipping gyroscope has missed",
+    "head": "a simulated blow to a head with four accelerometers, against its truth",
     "drive": "a car, GNSS withheld for a while and compared with RTK",
     "jump": "a simulated ski jump, against its truth",
     "avalanche": "a simulated ball in an avalanche, against its truth"}

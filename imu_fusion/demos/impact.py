@@ -19,10 +19,10 @@ from imu_fusion.report.recording import write_recording_report
 _MIMU_RANGE = 34.0
 
 
-def show(out: Path, console: Console) -> None:
-    """Recover a gyroscope that clips at 1000 deg/s by eight accelerometers (mimu4444)."""
-    bag, preset = data_folder("bags") / "mimu4444", data_folder("config") / "mimu4444.yaml"
-    recording, smoothed = out / "recording", out / "smoothed"
+def replay(bag: Path, preset: Path, out: Path) -> Path:
+    """Replay a recording through the node of the acceleration field, under a parameter file; the
+    recording below ``out`` of what it publishes."""
+    recording = out / "recording"
     with NodeProcesses(out / "logs") as nodes:
         nodes.start("recorder", out=str(recording), overwrite=True)
         nodes.start("acceleration_field_estimator", params_file=preset, qos="reliable")
@@ -30,6 +30,13 @@ def show(out: Path, console: Console) -> None:
                     wait_for_nodes=("recorder", "acceleration_field_estimator"))
         nodes.wait("replayer", 300)
         nodes.wait("recorder", 60)
+    return recording
+
+
+def show(out: Path, console: Console) -> None:
+    """Recover a gyroscope that clips at 1000 deg/s by eight accelerometers (mimu4444)."""
+    bag, preset = data_folder("bags") / "mimu4444", data_folder("config") / "mimu4444.yaml"
+    recording, smoothed = replay(bag, preset, out), out / "smoothed"
     values = load(preset)["acceleration_field_estimator"]
     (limit,) = values["sensor"]["gyro_range"]
     preset_smoothed = out / "smoothed.yaml"

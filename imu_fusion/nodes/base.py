@@ -27,6 +27,7 @@ from imu_fusion.errors import INCOMPLETE, ImuFusionError, ParameterError, TopicE
 from imu_fusion.kernels import is_compiling
 from imu_fusion.messages.transforms import TF_TYPE
 from imu_fusion.nodes import NODES
+from imu_fusion.nodes.ending import ends_within
 from imu_fusion.nodes.flow import steady_timer
 from imu_fusion.parameters import file as parameter_file
 from imu_fusion.parameters.declare import ParameterInfo, Parameters, unknown_parameter
@@ -36,6 +37,7 @@ P = TypeVar("P", bound=Parameters)
 
 _WIDE = 2**31 - 1  # of a side without a bound: editors of parameters take no more
 FAREWELL = 2.0  # s, in which a node that was asked to stop ends its session
+LEAVING = 5  # s, in which it leaves the middleware
 IDLE = 0.2  # s, the longest wait of the executor: how late a signal is noticed
 
 # Parameters that belong to rclpy, not to us.
@@ -309,8 +311,11 @@ def _run(node_class, params_files):
             node.close()
         finally:
             executor.shutdown()
-            node.destroy_node()
-    return INCOMPLETE if node.problems else 0
+            code = INCOMPLETE if node.problems else 0
+            with ends_within(LEAVING, exit_code(came[0]) if came
+                             else 1 if sys.exc_info()[0] else code):
+                node.destroy_node()
+    return code
 
 
 def usage(node_class: type[Node]) -> str:

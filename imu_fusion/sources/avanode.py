@@ -29,7 +29,7 @@ from imu_fusion.sources.source import (
     number,
     numbers,
 )
-from imu_fusion.sources.table import Rows, TableReader
+from imu_fusion.sources.table_reader import Rows, TableReader
 
 _WRAP = 2 ** 32    # of the clock of microseconds
 _FIX_3D = (3, 4)   # UBX fixType: 3-D, 3-D with dead reckoning

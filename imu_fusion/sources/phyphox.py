@@ -1,53 +1,33 @@
-"""phyphox (https://phyphox.org): a phone's sensors, exported or asked for over its network.
+"""phyphox (https://phyphox.org): exports of a phone's sensors.
 
-Exports are a folder or an archive of CSV (comma, semicolon or tab; decimal point or comma), or an
+They are a folder or an archive of CSV (comma, semicolon or tab; decimal point or comma), or an
 Excel file, with a table per sensor and, from version 1.1.9 on, ``meta/time.csv`` with the phone's
-clock; without it times count from :data:`~imu_fusion.sources.source.EPOCH`. Live, the phone is
-asked for ``/config`` once, then for what is new in each buffer. All sensors of a phone have one
-clock, each its own rate: forces are brought to the stamps of the gyroscope.
-
-Nothing is made up: a position without a valid accuracy is no fix, a speed without direction no
-velocity. Accuracies are taken as standard deviations of each axis (phones mean 68 % of the circle,
-or do not say). Protocol: https://phyphox.org/wiki/index.php/Remote_interface_communication.
+clock; without it times count from :data:`~imu_fusion.sources.source.EPOCH`.
 """
 
 import io
-import json
 import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import PurePosixPath
-from urllib.parse import quote
 
 import numpy as np
 
 from imu_fusion.errors import SampleError
-from imu_fusion.samples.logs import FixLog, MagLog, VelocityLog
 from imu_fusion.sources.description import TableParams
-from imu_fusion.sources.pairing import Pairing
+from imu_fusion.sources.phone import LONGEST, UNIX, Phone, locations
 from imu_fusion.sources.source import (
     BROKEN,
     EPOCH,
-    FIX_TOPIC,
-    FIXED,
     IMU_TOPIC,
     LARGEST_WHOLE,
-    MAG_TOPIC,
-    NO_FIX,
-    VELOCITY_TOPIC,
     Block,
-    Source,
     WholeSource,
-    named,
 )
-from imu_fusion.sources.table import UNKNOWN_CLIMB_SD, Rows, TableReader
+from imu_fusion.sources.table_reader import Rows, TableReader
+from imu_fusion.sources.times import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
-_LONGEST = 1e9    # s, of an experiment
-_UNIX = (1e8, 9e9)    # s, of a clock that has been set
-# A phone's ground speed comes without accuracy; receivers are within some 0.5 m/s.
-_SPEED_SD = 0.5
 _ACCELERATION, _RATE, _FIELD = ("m/s^2", "m/s²"), ("rad/s",), ("µT", "μT")
 _SENSORS = {"accelerometer": _ACCELERATION, "gyroscope": _RATE, "magnetometer": _FIELD}
 _LINEAR = re.compile("lin[eé]a|without|ohne|sans", re.IGNORECASE)
@@ -56,54 +36,7 @@ _LINEAR = re.compile("lin[eé]a|without|ohne|sans", re.IGNORECASE)
 _LOCATION = {"latitude": ("°",), "longitude": ("°",), "height|altitude": ("m",),
              "velocity|speed": ("m/s",), "direction": ("°",), "horizontal accuracy": ("m",),
              "vertical accuracy": ("m", "°")}
-_TIME_ASKED = 3    # times; versions of phyphox that do not tell count from EPOCH
 _XLS = b"\xd0\xcf\x11\xe0"
-
-
-class Phone:
-    """Readings of a phone's sensors, whose stamps are of one clock, to samples."""
-
-    def __init__(self) -> None:
-        self.pairing = Pairing()
-        self._seen: set[str] = set()
-
-    def vectors(self, kind: str, stamp: np.ndarray, values: np.ndarray) -> list[Block]:
-        """Samples that readings (n, 3) in SI make complete; kind: accelerometer, gyroscope or
-        magnetometer."""
-        self._seen.add(kind)
-        if kind == "magnetometer":
-            return named({MAG_TOPIC: MagLog(stamp, values)})
-        return named({IMU_TOPIC: self.pairing.add(**{
-            "forces" if kind == "accelerometer" else "rates": (stamp, values)})})
-
-    def remarks(self) -> list[str]:
-        """What to say of the readings at the end."""
-        there = [kind for kind in ("accelerometer", "gyroscope") if kind in self._seen]
-        alone = [f"{IMU_TOPIC} needs accelerometer and gyroscope; there is the {there[0]} alone"
-                 ] if len(there) == 1 else []
-        return alone + self.pairing.remarks()
-
-    def finish(self) -> list[Block]:
-        """What waited for more."""
-        return named({IMU_TOPIC: self.pairing.finish()})
-
-
-def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
-    """Fixes and velocities of a phone: (n, 7) latitude and longitude in degrees, height m, speed
-    m/s, direction deg, accuracy horizontal and vertical m."""
-    lat, lon, height, speed, direction, sd_h, sd_v = values.T
-    valid = (sd_h > 0) & (sd_v > 0) & np.isfinite(sd_h) & np.isfinite(sd_v)
-    cov = np.zeros((len(stamp), 3, 3))
-    for k, sd in enumerate((sd_h, sd_h, sd_v)):
-        cov[valid, k, k] = sd[valid] ** 2
-    there = np.isfinite(values[:, :3]).all(axis=1)
-    fixes = FixLog(stamp, lat, lon, height, cov, np.where(valid, FIXED, NO_FIX))[there]
-    course = np.radians(direction)    # clockwise from north
-    moves = (speed >= 0) & (direction >= 0)
-    with np.errstate(invalid="ignore", over="ignore"):    # of an infinite one
-        vel = np.column_stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed])
-    cov = np.tile(np.diag([_SPEED_SD, _SPEED_SD, UNKNOWN_CLIMB_SD]) ** 2, (len(stamp), 1, 1))
-    return named({FIX_TOPIC: fixes, VELOCITY_TOPIC: VelocityLog(stamp, vel, cov)[moves]})
 
 
 class PhyphoxExport(WholeSource):
@@ -182,7 +115,7 @@ class _Sheet:
         the time."""
         def read(rows):
             found = np.column_stack([rows.lines, *(self._column(rows, name) for name in names)])
-            self._check(rows, found, ~(np.abs(found[:, 1]) < _LONGEST), lambda row: (
+            self._check(rows, found, ~(np.abs(found[:, 1]) < LONGEST), lambda row: (
                 f", column 'Time': {row[1]:g} s is not a time since the start of the experiment"))
             if degrees:
                 self._check(rows, found, (np.abs(found[:, 2]) > 90) | (np.abs(found[:, 3]) > 360),
@@ -308,7 +241,7 @@ def _clock(sheet: _Sheet | None, lost: Counter[str]) -> list[tuple[float, int]] 
         return None
     starts = [(float(t), round(u * 1000) * 1_000_000 - round(t * NANOSECONDS))
               for event, t, u in sheet.events(names, lost)
-              if event == "START" and abs(t) < _LONGEST and _UNIX[0] < u < _UNIX[1]]
+              if event == "START" and abs(t) < LONGEST and UNIX[0] < u < UNIX[1]]
     return starts or None
 
 
@@ -317,137 +250,3 @@ def _stamps(time: np.ndarray, clock: list[tuple[float, int]] | None) -> np.ndarr
     stretch = np.clip(np.searchsorted([t for t, _ in zeros], time, "right") - 1, 0, None)
     return np.array([zero for _, zero in zeros])[stretch] + np.round(
         time * NANOSECONDS).astype(np.int64)
-
-
-class PhyphoxLive(Source):
-    """The remote interface of a running experiment: feed it what was asked for, under the path
-    that :meth:`request` gave."""
-
-    def __init__(self, strict: bool = False) -> None:
-        super().__init__(strict)
-        self.restart()
-
-    def restart(self) -> None:
-        """Ask anew which buffers there are."""
-        self._phone = Phone()
-        self._buffers: dict[str, dict[str, str]] = {}    # sensor -> {output: buffer}
-        self._last: dict[str, float] = {}                # sensor -> time of its last reading
-        self._session = ""
-        self._measures = False
-        self._asked_time = 0     # how often since it was started
-        self._zero: int | None = None
-
-    def request(self) -> str | None:
-        if not self._buffers:
-            return "/config"
-        if self._zero is None and self._measures and self._asked_time < _TIME_ASKED:
-            return "/time"
-        parts = []
-        for sensor, outputs in self._buffers.items():
-            time = outputs["t"]
-            last = self._last.get(sensor)
-            after = "full" if last is None else repr(last)
-            parts.append(f"{quote(time)}={after}")
-            parts += [f"{quote(name)}={after}" + (f"%7C{quote(time)}" if last is not None else "")
-                      for output, name in outputs.items() if output != "t"]
-        return "/get?" + "&".join(parts)
-
-    def feed(self, data: bytes, part: str = "") -> list[Block]:
-        self._asked_time += part.startswith("/time")
-        try:
-            answer = json.loads(data)
-            if part.startswith("/config"):
-                self._learn(answer)
-            elif part.startswith("/time"):
-                self._set_clock(answer)
-            elif part.startswith("/get"):
-                return self._readings(answer)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError,
-                OverflowError) as error:
-            if isinstance(error, SampleError):
-                raise
-            if part.startswith("/config"):
-                raise SampleError("the answer to /config is not phyphox's; is it the phone that "
-                                  "has this address?") from None
-            self.lose("answers that are not phyphox's", part[:20])
-        return []
-
-    def finish(self) -> list[Block]:
-        return self._phone.finish()
-
-    def _learn(self, config):
-        known = {"accelerometer": "xyzt", "gyroscope": "xyzt", "magnetic_field": "xyzt"}
-        for entry in config["inputs"]:
-            outputs = {output: str(name) for pair in entry["outputs"]
-                       for output, name in pair.items() if output != "abs"}
-            source = str(entry["source"])
-            if source in known and set(known[source]) <= outputs.keys():
-                self._buffers[source] = {axis: outputs[axis] for axis in known[source]}
-            elif source == "location" and {"lat", "lon", "t"} <= outputs.keys():
-                self._buffers[source] = outputs
-        if not self._buffers:
-            raise SampleError("the running experiment of phyphox has none of accelerometer, "
-                              "gyroscope, magnetometer and location with times: open one that has, "
-                              "such as config/imu_fusion.phyphox")
-        self.device = f"phyphox: {config.get('title', '')}"[:80]
-
-    def _set_clock(self, events):
-        starts = [e for e in events if e.get("event") == "START"]
-        if starts:
-            last = starts[-1]
-            since, unix = float(last["experimentTime"]), float(last["systemTime"])
-            if not (abs(since) < _LONGEST and _UNIX[0] < unix < _UNIX[1]):
-                raise ValueError
-            self._zero = round(unix * 1000) * 1_000_000 - round(since * NANOSECONDS)
-
-    def _readings(self, answer):
-        status = answer.get("status", {})
-        session = str(status.get("session", ""))
-        if self._session and session != self._session:
-            self._begin_anew("sessions of phyphox that were left: the experiment began anew")
-        self._session = session
-        measures = bool(status.get("measuring"))
-        if measures and not self._measures:
-            self._zero, self._asked_time = None, 0    # started, or gone on with after a pause
-        self._measures = measures
-        if self._zero is None and (not measures or self._asked_time < _TIME_ASKED):
-            return []    # the readings are asked for again when their zero is known
-        blocks: list[Block] = []
-        arrays = {name: np.array([np.nan if not isinstance(v, (int, float)) else v
-                                  for v in entry["buffer"]], dtype=np.float64)
-                  for name, entry in answer["buffer"].items()}
-        for sensor, outputs in self._buffers.items():
-            time = arrays.get(outputs["t"])
-            if time is None or not len(time):
-                continue
-            last = self._last.get(sensor)
-            if last is not None and time[-1] < last:
-                self._begin_anew("stretches of phyphox that were left: it was cleared")
-                last = None
-            columns = {o: arrays.get(name, np.empty(0)) for o, name in outputs.items()}
-            # A reading may have reached some of its buffers when the phone answers.
-            n = min(len(c) for o, c in columns.items() if len(c) or o in "xyzt")
-            new = np.flatnonzero((time[:n] >= 0) & (time[:n] < _LONGEST) & (time[:n] > (
-                -np.inf if last is None else last)))
-            if len(new):
-                self._last[sensor] = float(time[new[-1]])
-                blocks += self._samples(sensor, time[new], {
-                    o: c[new] for o, c in columns.items() if len(c) >= n})
-        return blocks
-
-    def _samples(self, sensor, time, columns):
-        stamp = (EPOCH if self._zero is None else self._zero) + np.round(
-            time * NANOSECONDS).astype(np.int64)
-        if sensor == "location":
-            none = np.full(len(time), np.nan)
-            height = "zwgs84" if "zwgs84" in columns else "z"
-            return locations(stamp, np.column_stack([columns.get(name, none) for name in (
-                "lat", "lon", height, "v", "dir", "accuracy", "zAccuracy")]))
-        values = np.column_stack([columns[axis] for axis in "xyz"])
-        if sensor == "magnetic_field":
-            return self._phone.vectors("magnetometer", stamp, values * 1e-6)
-        return self._phone.vectors(sensor, stamp, values)
-
-    def _begin_anew(self, why):
-        self.lost[why] += 1
-        self._phone, self._last, self._zero, self._asked_time = Phone(), {}, None, 0

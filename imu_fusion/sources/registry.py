@@ -12,7 +12,8 @@ from imu_fusion.sources.avanode import AvanodeGnss, AvanodeImu
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.gnss import Frames, Receiver
 from imu_fusion.sources.gpx import Gpx
-from imu_fusion.sources.phyphox import PhyphoxExport, PhyphoxLive
+from imu_fusion.sources.phyphox import PhyphoxExport
+from imu_fusion.sources.phyphox_live import PhyphoxLive
 from imu_fusion.sources.sensor_logger import SensorLoggerExport, SensorLoggerPush
 from imu_fusion.sources.sketch import sketch
 from imu_fusion.sources.source import Source

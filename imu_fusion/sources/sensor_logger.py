@@ -21,7 +21,7 @@ import numpy as np
 from imu_fusion.errors import SampleError
 from imu_fusion.samples.logs import FixLog, VelocityLog
 from imu_fusion.sources.description import TableParams, TimeParams
-from imu_fusion.sources.phyphox import Phone
+from imu_fusion.sources.phone import Phone
 from imu_fusion.sources.source import (
     FIX_TOPIC,
     FIXED,
@@ -33,7 +33,8 @@ from imu_fusion.sources.source import (
     WholeSource,
     named,
 )
-from imu_fusion.sources.table import UNKNOWN_CLIMB_SD, TableReader
+from imu_fusion.sources.table import UNKNOWN_CLIMB_SD
+from imu_fusion.sources.table_reader import TableReader
 
 _VECTORS = ("accelerometer", "gravity", "totalacceleration", "accelerometeruncalibrated",
             "gyroscope", "gyroscopeuncalibrated", "magnetometer", "magnetometeruncalibrated")

@@ -23,15 +23,14 @@ from imu_fusion.sources.phyphox import PhyphoxExport
 from imu_fusion.sources.sensor_logger import SensorLoggerExport
 from imu_fusion.sources.table import TableSource
 from imu_fusion.sources.ximu3 import Ximu3
-from test.sources.logs import read, together
-from test.sources.test_formats import (
+from test.sources.exports import (
     TIME,
     Server,
     batches,
     export,
-    read_parts,
     sensor_logger,
 )
+from test.sources.logs import read, read_parts, together
 from test.sources.test_splitting import escaped, nmea, solution
 
 TABLE = {"header": False, "time": {"column": "1", "unit": "us"},

@@ -2,6 +2,8 @@
 
 import importlib
 import math
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import pytest
@@ -238,3 +240,16 @@ def test_files_named_in_a_parameter_file_are_relative_to_it(tmp_path):
     assert Reader.seen.pop() == Places(str(tmp_path / "hill.yaml"), "zakopane_hs140")
     assert run_node(Reader, [*arguments, "-p", "here:=elsewhere/hill.yaml"]) == 0
     assert Reader.seen.pop() == Places("elsewhere/hill.yaml", str(tmp_path / "hill.yaml"))
+
+
+@pytest.mark.parametrize("held, code", [(0, 0), (60, 3)])
+def test_a_process_ends_where_native_code_keeps_the_interpreter(held, code):
+    """As Fast DDS does where participants leave together: no thread of Python runs any more."""
+    found = subprocess.run([sys.executable, "-c", f"""if True:
+        import ctypes
+        from imu_fusion.nodes.ending import ends_within
+        print("said before")
+        with ends_within(1, 3):
+            ctypes.PyDLL(None).sleep({held})
+        """], check=False, capture_output=True, text=True, timeout=50)
+    assert (found.returncode, found.stdout.strip(), found.stderr) == (code, "said before", "")

@@ -29,8 +29,8 @@ from imu_fusion.recordings.logs import read_log
 from imu_fusion.sources.source import EPOCH
 from test.nodes.devices import TABLE, TEN_MINUTES, truth
 from test.nodes.test_processes import ENVIRONMENT
+from test.sources.exports import TIME, export
 from test.sources.logs import same
-from test.sources.test_formats import TIME, export
 
 ROOT = Path(__file__).resolve().parents[2]
 ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE,

@@ -23,6 +23,11 @@ def read(source, data, part="", cuts=()):
     return together(blocks + source.finish())
 
 
+def read_parts(source, files):
+    blocks = [block for part, data in files.items() for block in source.feed(data, part)]
+    return together(blocks + source.finish())
+
+
 def same(a, b):
     """Whether two sets of logs are equal, sample by sample, bit for bit."""
     return a.keys() == b.keys() and all(

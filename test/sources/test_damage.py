@@ -14,9 +14,9 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.gpx import Gpx
 from imu_fusion.sources.table import TableSource
+from test.sources.exports import export, zipped
 from test.sources.logs import read
 from test.sources.test_exports import LOCATION
-from test.sources.test_formats import export, zipped
 from test.sources.test_splitting import STREAMS
 
 TEXTS = ["phyphox", "phyphox_location", "sensor_logger", "avanode_imu", "avanode_gnss", "table"]

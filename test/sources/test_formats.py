@@ -1,27 +1,21 @@
 """Each format against what its documentation, or an independent writer, says."""
 
-import io
-import json
 import re
 import struct
-import zipfile
 
 import numpy as np
-import openpyxl
 import pytest
 from pyubx2 import GET, UBXMessage
 
-from imu_fusion.errors import ImuFusionError, SampleError
+from imu_fusion.errors import ImuFusionError
 from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.sources.gnss import Receiver
-from imu_fusion.sources.phyphox import PhyphoxExport, PhyphoxLive
-from imu_fusion.sources.registry import recognise
-from imu_fusion.sources.sensor_logger import SensorLoggerExport, SensorLoggerPush
-from imu_fusion.sources.source import EPOCH, STANDARD_GRAVITY, is_number
+from imu_fusion.sources.source import EPOCH
 from imu_fusion.sources.ulog import Ulog
 from imu_fusion.sources.ximu3 import Ximu3, Ximu3Csv
-from test.sources.logs import read, same, together, ulog
+from test.sources.exports import export, sensor_logger, zipped
+from test.sources.logs import read, read_parts, same, ulog
 from test.sources.test_splitting import escaped, nmea, solution
 
 
@@ -167,244 +161,6 @@ def test_a_session_of_an_x_imu3_is_the_same_as_csv():
     for topic, log in expected.items():
         assert list(found[topic].stamp) == list(log.stamp)
         assert found[topic].flat() == pytest.approx(log.flat(), rel=1e-12)
-
-
-PHONE = {"Accelerometer": ("Acceleration", "m/s^2", 0.01, 0.0, (0.1, -2.5, 9.75)),
-         "Gyroscope": ("Gyroscope", "rad/s", 0.012, 0.004, (0.25, 0.5, -1.5)),
-         "Magnetometer": ("Magnetic field", "µT", 0.02, 0.0, (20.0, -3.5, -40.0))}
-TIME = ('"event","experiment time","system time","system time text"\n'
-        '"START",0.0E0,1770000000.250,"2026-02-02"\n"PAUSE",.5E0,1770000000.750,""\n'
-        '"START",.5E0,1770000100.750,""\n')
-
-
-def readings(step, start, first):
-    """(times, rows) of one sensor of a phone for a second; values of 9 digits."""
-    times = np.round(start + step * np.arange(int(1 / step)), 9)
-    return times, np.round(np.array(first) + np.outer(np.sin(7 * times), [0.3, 0.2, 0.1]), 7)
-
-
-def export(delimiter=",", decimal=".", clock=TIME, long_names=True):
-    """{part: bytes} of a phyphox export."""
-    def cell(v):
-        return f"{v:.9E}".replace(".", decimal)
-
-    files = {}
-    for name, (label, unit, step, start, first) in PHONE.items():
-        times, rows = readings(step, start, first)
-        prefix = f"{label} " if long_names else ""
-        axes = "xyz" if long_names else "XYZ"
-        lines = [delimiter.join(['"Time (s)"', *(f'"{prefix}{a} ({unit})"' for a in axes)])]
-        lines += [delimiter.join(map(cell, (t, *row))) for t, row in zip(times, rows)]
-        files[f"walk/{name}.csv"] = "\n".join(lines).encode() + b"\n"
-    if clock:
-        files["walk/meta/time.csv"] = clock.encode()
-    return files
-
-
-def read_parts(source, files):
-    blocks = [block for part, data in files.items() for block in source.feed(data, part)]
-    return together(blocks + source.finish())
-
-
-def test_all_dialects_of_phyphox_are_equal_and_its_clock_goes_on_in_a_pause():
-    expected = read_parts(PhyphoxExport(), export())
-    for delimiter, decimal in ((";", ","), ("\t", "."), ("\t", ","), (";", ".")):
-        assert same(read_parts(PhyphoxExport(), export(delimiter, decimal)), expected)
-    assert same(read_parts(PhyphoxExport(), export(long_names=False)), expected)
-    mag = expected["imu/mag"]
-    assert mag.stamp[0] == 1770000000_250_000_000
-    assert mag.stamp[-1] == 1770000100_250_000_000 + 980_000_000
-    assert np.linalg.norm(mag.mag, axis=1) == pytest.approx(np.full(50, 44.9e-6), abs=1e-6)
-
-
-def test_an_export_in_another_language_is_the_same():
-    words = {b"Time": b"Zeit", b"Acceleration": b"Beschleunigung", b"Gyroscope": b"Drehrate",
-             b"Magnetic field": b"Feld"}
-    files = {}
-    for name, data in zip(("Kraft", "Drehung", "Feld", "meta/time"), export().values()):
-        for english, german in words.items():
-            data = data.replace(english, german)
-        files[f"walk/{name}.csv"] = data
-    assert recognise(files).name == "phyphox"
-    assert same(read_parts(PhyphoxExport(), files), read_parts(PhyphoxExport(), export()))
-
-
-def test_an_accelerometer_alone_is_said(tmp_path):
-    part, data = next(iter(export().items()))
-    (tmp_path / "walk").mkdir()
-    (tmp_path / part).write_bytes(data)
-    with pytest.raises(ImuFusionError, match="there is the accelerometer alone"):
-        open_bag(tmp_path / "walk")
-
-
-def test_an_excel_export_is_read_by_its_library(tmp_path):
-    book = openpyxl.Workbook()
-    book.remove(book.active)
-    for part, data in export(delimiter=";").items():
-        name = "Metadata Time" if part.endswith("time.csv") else part[5:-4]
-        sheet = book.create_sheet(name)
-        for line in data.decode().splitlines():
-            cells = [c.strip('"') for c in line.split("," if "time.csv" in part else ";")]
-            sheet.append([float(c) if is_number(c) else c for c in cells])
-    book.save(tmp_path / "walk.xlsx")
-    found = read_parts(PhyphoxExport(), {"walk.xlsx": (tmp_path / "walk.xlsx").read_bytes()})
-    assert same(found, read_parts(PhyphoxExport(), export()))
-
-
-class Server:
-    """phyphox's remote interface, as its documentation words it: answers to paths."""
-
-    def __init__(self, clock=1770000000.25):
-        self.buffers, self.outputs = {}, {}
-        for source, name in (("accelerometer", "Accelerometer"), ("gyroscope", "Gyroscope"),
-                             ("magnetic_field", "Magnetometer")):
-            times, rows = readings(*PHONE[name][2:])
-            for axis, values in zip("xyzt", (*rows.T, times)):
-                self.buffers[f"{source[:3]}{axis}"] = values
-            self.outputs[source] = [{axis: f"{source[:3]}{axis}"} for axis in "xyzt"]
-        self.clock, self.session, self.now, self.measuring = clock, "aa11", 0.0, True
-
-    def answer(self, path):
-        if path == "/config":
-            return {"title": "All", "inputs": [{"source": s, "outputs": o}
-                                               for s, o in self.outputs.items()]}
-        if path == "/time":
-            return [{"event": "START", "experimentTime": 0.0, "systemTime": self.clock}]
-        buffers = {}
-        for item in path.partition("?")[2].split("&"):
-            name, _, wanted = item.partition("=")
-            threshold, _, reference = wanted.partition("%7C")
-            times = self.buffers[(reference or name)[:3] + "t"]
-            shown = times <= self.now
-            if threshold != "full":
-                shown &= times > float(threshold)
-            buffers[name] = {"size": 0, "updateMode": "full" if threshold == "full" else "partial",
-                             "buffer": [float(v) for v in self.buffers[name][shown]]}
-        return {"buffer": buffers, "status": {"session": self.session,
-                                              "measuring": self.measuring}}
-
-
-def poll(source, server):
-    path = source.request()
-    return source.feed(json.dumps(server.answer(path)).encode(), path)
-
-
-@pytest.mark.parametrize("step", [0.03, 0.25, 2.0])
-def test_what_phyphox_told_live_is_what_it_exports(step):
-    source, server = PhyphoxLive(), Server()
-    blocks = poll(source, server)
-    for k in range(int(1 / step) + 6):
-        server.now = k * step
-        blocks += poll(source, server)
-    found = together(blocks + source.finish())
-    start_only = "\n".join(TIME.splitlines()[:2])
-    assert same(found, read_parts(PhyphoxExport(), export(clock=start_only)))
-    assert not source.lost and "All" in source.device
-
-
-def test_phyphox_cleared_begins_anew_and_broken_answers_are_counted():
-    source, server = PhyphoxLive(), Server()
-    for now in (0.0, 0.2, 0.4, 0.6):
-        server.now = now
-        poll(source, server)
-    server.session, server.now = "bb22", 0.1
-    source.feed(b"<html>404</html>", "/get?x")
-    for _ in range(3):
-        again = poll(source, server)
-    stamps = together(again or poll(source, server))
-    assert sum(source.lost.values()) == 2
-    assert all(log.stamp[0] <= 1770000000_350_000_000 for log in stamps.values())
-
-
-def sensor_logger(platform="ios", standardised=False, **without):
-    """{part: bytes} of a Sensor Logger export; the phone lies flat, its top is pushed."""
-    times = 1_698_501_144_401_773_000 + 10_000_000 * np.arange(60)
-    sign = -1.0 if platform == "ios" and not standardised else 1.0
-    head = "time,seconds_elapsed,z,y,x\n"
-
-    def rows(value, shift=0):
-        return head + "".join(f"{t + shift},{1e-2 * k},{value[2]},{value[1]},{value[0]}\n"
-                              for k, t in enumerate(times))
-
-    meta = ("version,device name,recording epoch time,platform,appVersion,standardisation\n"
-            f"3,Phone,1698501144400,{platform},1.64,{str(standardised).lower()}\n")
-    files = {
-        "Metadata": meta, "Accelerometer": rows([0.0, sign * 0.5, 0.0]),
-        "Gravity": rows([0.0, 0.0, sign * STANDARD_GRAVITY]),
-        "Gyroscope": rows([0.1, 0.2, 0.3], 3_000_000),
-        "Magnetometer": rows([20.0, 0.0, -40.0]),
-        "Location": "time,seconds_elapsed,bearingAccuracy,speedAccuracy,verticalAccuracy,"
-                    "horizontalAccuracy,speed,bearing,altitude,longitude,latitude\n"
-                    f"{times[0] - 90_000_000_000},-90,1,1,1,1,0,0,1,1,1\n"
-                    f"{times[5]},.05,1,.5,3,2,4,90,500.5,8.5,47.5\n"
-                    f"{times[9]},.09,-1,-1,-1,-1,-1,-1,500.5,8.5,47.5\n"}
-    return {f"log/{name}.csv": text.encode() for name, text in files.items()
-            if name not in without.get("without", ())}
-
-
-@pytest.mark.parametrize("platform, standardised", [
-    ("ios", False), ("ios", True), ("android", False)])
-def test_a_phone_that_lies_flat_feels_g_upwards_on_either_system(platform, standardised):
-    source = SensorLoggerExport()
-    found = read_parts(source, sensor_logger(platform, standardised))
-    imu = found["imu/data_raw"]
-    assert imu.acc == pytest.approx(np.tile([0.0, 0.5, STANDARD_GRAVITY], (59, 1)))
-    assert imu.gyr[0] == pytest.approx([0.1, 0.2, 0.3])
-    assert imu.stamp[0] == 1_698_501_144_404_773_000    # beyond what a float tells apart
-    assert found["imu/mag"].mag[0] == pytest.approx([20e-6, 0.0, -40e-6])
-    fix, velocity = found["fix"], found["fix_velocity"]
-    assert list(fix.status) == [0, -1] and np.diag(fix.cov_enu[0]) == pytest.approx([4, 4, 9])
-    assert velocity.vel_world == pytest.approx(np.array([[4.0, 0.0, 0.0]]))
-    assert velocity.cov_world[0, 0, 0] == pytest.approx(0.25)
-    assert any("before the recording" in remark for remark in source.remarks)
-
-
-def test_without_the_platform_the_sign_is_not_guessed():
-    files = sensor_logger(without=("Metadata",))
-    with pytest.raises(SampleError, match="log: Metadata.csv does not tell the platform"):
-        read_parts(SensorLoggerExport(), files)
-    found = read_parts(SensorLoggerExport(platform="ios"), files)
-    assert found["imu/data_raw"].acc[0, 2] == pytest.approx(STANDARD_GRAVITY)
-
-
-def batches(size=7):
-    """What Sensor Logger pushes of the same session: standardised, of any order within it."""
-    files, payload = sensor_logger("android"), []
-    for name in ("Accelerometer", "Gravity", "Gyroscope", "Magnetometer"):
-        for line in files[f"log/{name}.csv"].decode().splitlines()[1:]:
-            stamp, since, z, y, x = line.split(",")
-            payload.append((float(since), {"name": name.lower(), "time": int(stamp), "values": {
-                "z": float(z), "y": float(y), "x": float(x)}}))
-    entries = [entry for _, entry in sorted(payload, key=lambda pair: pair[0])]
-    return [json.dumps({"messageId": k, "sessionId": "s", "deviceId": "d",
-                        "payload": entries[size * k:size * (k + 1)]}).encode()
-            for k in range(-(-len(entries) // size))]
-
-
-def test_pushed_out_of_order_is_what_is_exported():
-    source, pushed = SensorLoggerPush(), batches()
-    order = [0, 2, 1, 3, 6, 5, 4, *range(7, len(pushed))]
-    found = together([block for k in order for block in source.feed(pushed[k])] + source.finish())
-    expected = read_parts(SensorLoggerExport(), sensor_logger("android", without=("Location",)))
-    assert same(found, expected) and not source.lost
-
-
-def test_a_batch_that_never_comes_is_counted_and_the_rest_goes_on():
-    source, pushed = SensorLoggerPush(), batches()
-    for k, batch in enumerate(pushed):
-        if k != 4:
-            source.feed(batch)
-    source.feed(pushed[4])
-    assert source.lost["batches that did not come"] == 1
-    assert source.lost["batches that came twice, or after those that had waited for them"] == 1
-
-
-def zipped(files):
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for part, data in files.items():
-            archive.writestr(part, data)
-    return stream.getvalue()
 
 
 @pytest.mark.parametrize("name, files, taken", [

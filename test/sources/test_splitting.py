@@ -11,7 +11,7 @@ from imu_fusion.errors import ImuFusionError
 from imu_fusion.sources.description import Description
 from imu_fusion.sources.gnss import Receiver
 from imu_fusion.sources.gpx import Gpx
-from imu_fusion.sources.phyphox import PhyphoxLive
+from imu_fusion.sources.phyphox_live import PhyphoxLive
 from imu_fusion.sources.registry import FORMATS
 from imu_fusion.sources.sensor_logger import SensorLoggerPush
 from imu_fusion.sources.sketch import sketch

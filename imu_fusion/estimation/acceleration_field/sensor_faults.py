@@ -110,7 +110,7 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
                else "")
     remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
     remarks = remarks or _together(fits, array)
-    remarks += _biases(fits, array, state)
+    remarks += _gyro_bias(array, state)
     moved = [fit.name for fit in fits if fit.mounting]
     if len(moved) > len(fits) / 2:
         # Of so many, what they have in common is more likely.
@@ -146,25 +146,18 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
     return remarks
 
 
-def _biases(fits, array, state):
-    """Texts on biases that are far beyond what was said of them."""
-    remarks = []
-    channels = array.channels
-    beyond = (np.abs(state.x[BIAS:BIAS + len(channels)]) > _BEYOND * channels["bias_sd"]) & (
-        channels["bias_sd"] > 0.0) & (channels["bias_walk"] == 0.0)
-    for number in np.unique(channels["sensor"][beyond]):
-        values = state.x[BIAS:BIAS + len(channels)][channels["sensor"] == number]
-        if number == len(fits):
-            remarks.append(
-                f"the gyroscope fits best with biases of {_vector(values, 3)} rad/s: raise "
-                "sensor.gyro_bias_sd; or it turned where it was taken to be still, or its unit, "
-                "axes or sign are wrong")
-        elif not fits[number].fault:
-            name = fits[number].name
-            remarks.append(
-                f"accelerometer '{name}' fits best with biases of {_vector(values, 2)} m/s^2: "
-                f"raise accelerometers.{name}.bias_sd, or calibrate it")
-    return remarks
+def _gyro_bias(array, state):
+    """A text on a gyroscope's biases that are far beyond what was said of them. Those of
+    accelerometers take up errors of the motion, too, and say nothing by themselves."""
+    own = np.flatnonzero(array.channels["is_gyro"])
+    if not len(own):
+        return []
+    bias, sd = state.x[BIAS + own], array.channels["bias_sd"][own[0]]
+    if array.channels["bias_walk"][own[0]] > 0.0 or np.all(np.abs(bias) <= _BEYOND * sd):
+        return []
+    return [f"the gyroscope fits best with biases of {_vector(bias, 3)} rad/s: raise "
+            "sensor.gyro_bias_sd; or it turned where it was taken to be still, or its unit, axes "
+            "or sign are wrong"]
 
 
 def _together(fits, array):

@@ -14,13 +14,14 @@ import numpy as np
 
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation import fusion
-from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.rows import FLAG_NO_HEADING, ORIENTATION_DTYPE
 from imu_fusion.geometry.rotation import (
     quat_conjugate,
     quat_exp,
     quat_log,
     quat_multiply,
     quat_normalize,
+    quat_rotate,
     quat_to_matrix,
 )
 from imu_fusion.kernels import njit
@@ -29,6 +30,8 @@ from imu_fusion.kernels import njit
 # the innovations lasts for seconds (the sum of their autocorrelation is 1 to 4 s on a hand, a phone
 # and a robot). The log likelihood counts what repeats within 3 s once.
 _REPEATS = 150.0
+# Weight in the covariance of going round after a start in motion, where nothing tells against it.
+_DOUBT = 1.0 / 3.0
 _NEGLIGIBLE = 1e-6         # weight of a hypothesis that changes nothing any more
 _NO_TAPE = np.empty(0, es.TAPE)
 
@@ -55,7 +58,8 @@ def step(state, par, stamp, sample, row):
     for k in range(used):
         result = fusion.step(state[k], par[k], stamp, sample, rows[k], _NO_TAPE)
     if result > 0:
-        mix(rows, weights(state, par), row)
+        weight = weights(state, par)
+        mix(rows, weight, doubts(state, par, weight), row)
     return result
 
 
@@ -79,8 +83,8 @@ def weights(state, par):
     placed, best = 0.0, -math.inf
     for lasting in (False, True):
         for k in range(len(state)):
-            if (state[k].started and state[k].stamp == state[0].stamp
-                    and (par[k].lasting_acc_sd > 0.0) == lasting):
+            if (_takes_part(state, k) and (par[k].lasting_acc_sd > 0.0) == lasting
+                    and not _is_doubt(state, par, k)):
                 positions = placed if lasting else state[k].position_likelihood
                 out[k] = (state[k].log_likelihood + positions) / _REPEATS + par[k].log_prior
                 if not lasting and out[k] > best:
@@ -95,6 +99,32 @@ def weights(state, par):
 
 
 @njit
+def _takes_part(state, k):
+    return state[k].started and state[k].stamp == state[0].stamp
+
+
+@njit
+def _is_doubt(state, par, k):
+    """Whether a hypothesis takes part in the covariance alone. After a start in motion, where tilt
+    and bias begin unknown, lasting accelerations explain what there is, a hand's translations too:
+    samples can tell against them, and not for them."""
+    return state[k].began_in_motion and par[k].lasting_acc_sd > 0.0
+
+
+@njit
+def doubts(state, par, weight):
+    """Weights (k,), beside those of :func:`weights`, by which hypotheses that the mean does not
+    follow are part of its covariance."""
+    out = np.zeros(len(state))
+    best = likeliest(weight)
+    most = state[best].log_likelihood / _REPEATS + par[best].log_prior
+    for k in range(len(state)):
+        if _takes_part(state, k) and _is_doubt(state, par, k):
+            out[k] = _DOUBT * math.exp(min(state[k].log_likelihood / _REPEATS - most, 0.0))
+    return out
+
+
+@njit
 def likeliest(weight):
     """Index of the largest weight."""
     best = 0
@@ -105,12 +135,14 @@ def likeliest(weight):
 
 
 @njit
-def mix(rows, weight, row):
-    """Write the mixture of rows (k,) ORIENTATION_DTYPE with weights (k, or more that are zero) to
-    ``row``.
+def mix(rows, weight, doubt, row):
+    """Write the mixture of rows (k,) ORIENTATION_DTYPE with weights and doubts (k, or more that are
+    zero) to ``row``.
 
     Attitude and numbers are means, covariances those of the mixture: the mean one and the spread
-    of the means. Stamp, flags and what belongs to the sample are the likeliest row's.
+    of the means, with that of doubted ones about them. Stamp, flags and what belongs to the sample
+    are the likeliest row's. Without a heading the spread is that of the verticals, and so is that
+    of doubted ones.
     """
     best = likeliest(weight)
     row.stamp, row.flags = rows[best].stamp, rows[best].flags
@@ -125,19 +157,22 @@ def mix(rows, weight, row):
             row.cov_attitude[i, j] = rows[best].cov_attitude[i, j]
             row.cov_gyr[i, j] = rows[best].cov_gyr[i, j]
             row.cov_acc[i, j] = rows[best].cov_acc[i, j]
-    if weight[best] < 1.0:
-        _mix_attitude(rows, weight, best, row)
-        _mix_bias(rows, weight, row)
+    if weight[best] < 1.0 or doubt.max() > 0.0:
+        _mix_attitude(rows, weight, doubt, best, row)
+        _mix_bias(rows, weight, doubt, row)
 
 
 @njit
-def _mix_attitude(rows, weight, best, row):
+def _mix_attitude(rows, weight, doubt, best, row):
     """Mean attitude and its covariance, about the likeliest row's."""
     back = quat_conjugate(rows[best].quat_world_imu)
     off = np.empty((len(rows), 3))
     mean = np.zeros(3)
     for k in range(len(rows)):
-        apart = quat_log(quat_normalize(quat_multiply(back, rows[k].quat_world_imu)))
+        if doubt[k] > 0.0 or rows[best].flags & FLAG_NO_HEADING:
+            apart = _leaned(rows[best].quat_world_imu, rows[k].quat_world_imu)
+        else:
+            apart = quat_log(quat_normalize(quat_multiply(back, rows[k].quat_world_imu)))
         for i in range(3):
             off[k, i] = apart[i]
             mean[i] += weight[k] * apart[i]
@@ -149,18 +184,32 @@ def _mix_attitude(rows, weight, best, row):
         own = rows[k].cov_attitude
         for i in range(3):
             for j in range(3):
-                part = (off[k, i] - mean[i]) * (off[k, j] - mean[j])
+                part = 0.0
                 for a in range(3):
                     for b in range(3):
                         part += r[i, a] * own[a, b] * r[j, b]
-                cov[i, j] += weight[k] * part
+                cov[i, j] += weight[k] * part + (weight[k] + doubt[k]) * (
+                    (off[k, i] - mean[i]) * (off[k, j] - mean[j]))
     row.quat_world_imu[:] = quat_normalize(quat_multiply(rows[best].quat_world_imu,
                                                          quat_exp(mean, 1.0)))
     row.cov_attitude[:] = cov
 
 
 @njit
-def _mix_bias(rows, weight, row):
+def _leaned(quat, other):
+    """Rotation vector, imu axes of ``quat``, by which another attitude leans: no turn about up."""
+    up = quat_rotate(quat_conjugate(other), (0.0, 0.0, 1.0))
+    down = quat_rotate(quat_conjugate(quat), (0.0, 0.0, 1.0))
+    across = (up[1] * down[2] - up[2] * down[1], up[2] * down[0] - up[0] * down[2],
+              up[0] * down[1] - up[1] * down[0])
+    sine = math.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
+    cosine = up[0] * down[0] + up[1] * down[1] + up[2] * down[2]
+    scale = math.atan2(sine, cosine) / sine if sine > 0.0 else 1.0
+    return (across[0] * scale, across[1] * scale, across[2] * scale)
+
+
+@njit
+def _mix_bias(rows, weight, doubt, row):
     """Mean bias, and the rates and forces that follow from it, with their variances."""
     for i in range(3):
         bias = rate = force = 0.0
@@ -171,19 +220,20 @@ def _mix_bias(rows, weight, row):
         variance = var_rate = var_force = 0.0
         for k in range(len(rows)):
             off = rows[k].gyr_bias[i] - bias
-            variance += weight[k] * (rows[k].gyr_bias_sd[i] ** 2 + off * off)
-            var_rate += weight[k] * (rows[k].cov_gyr[i, i] + (rows[k].gyr[i] - rate) ** 2)
-            var_force += weight[k] * (rows[k].cov_acc[i, i] + (rows[k].acc[i] - force) ** 2)
+            both = weight[k] + doubt[k]
+            variance += weight[k] * rows[k].gyr_bias_sd[i] ** 2 + both * off * off
+            var_rate += weight[k] * rows[k].cov_gyr[i, i] + both * (rows[k].gyr[i] - rate) ** 2
+            var_force += weight[k] * rows[k].cov_acc[i, i] + both * (rows[k].acc[i] - force) ** 2
         row.gyr_bias[i], row.gyr[i], row.acc[i] = bias, rate, force
         row.gyr_bias_sd[i] = math.sqrt(variance)
         row.cov_gyr[i, i], row.cov_acc[i, i] = var_rate, var_force
 
 
 @njit
-def mix_all(rows, weight, out):
-    """:func:`mix` of rows (k, n) with the same weights (k,), to ``out`` (n,)."""
+def mix_all(rows, weight, doubt, out):
+    """:func:`mix` of rows (k, n) with the same weights and doubts (k,), to ``out`` (n,)."""
     here = np.empty(len(rows), ORIENTATION_DTYPE)
     for n in range(len(out)):
         for k in range(len(rows)):
             here[k] = rows[k, n]
-        mix(here, weight, out[n])
+        mix(here, weight, doubt, out[n])

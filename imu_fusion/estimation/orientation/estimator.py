@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.orientation import bank, kernel
+from imu_fusion.estimation.orientation import bank, kernel, wander
 from imu_fusion.estimation.orientation.alignment import Alignment, align, usable_mags
 from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.fixed_interval import smooth
@@ -297,12 +297,21 @@ class OrientationEstimator:
 
     def remarks(self) -> list[str]:
         """What makes the estimates so far doubtful, and what to do about it."""
-        realigned = int(self._counts(self._likeliest())["realigned"][0])
-        return [
-            f"{realigned} time{'s' * (realigned != 1)} rates and forces stood still where the "
-            "estimate took its gyroscope to turn: bias and attitude were wrong by more than they "
-            "were stated to be, and begin anew there; begin at rest, calibrate the gyroscope "
-            "(imu_fusion calibrate gyroscope) or raise sensor.gyro_bias_sd"] if realigned else []
+        best = self._likeliest()
+        realigned = int(self._counts(best)["realigned"][0])
+        found = []
+        if realigned:
+            found.append(
+                f"{realigned} time{'s' * (realigned != 1)} rates and forces stood still where the "
+                "estimate took its gyroscope to turn: bias and attitude were wrong by more than "
+                "they were stated to be, and begin anew there; begin at rest, calibrate the "
+                "gyroscope (imu_fusion calibrate gyroscope) or raise sensor.gyro_bias_sd")
+        if wander.is_lost(self._state[best]["wander"]["overall"]):
+            found.append(
+                "field, forces and rates contradict each other by far more than their stated "
+                "errors allow: the heading may be any; begin at rest, or calibrate the "
+                "magnetometer (imu_fusion calibrate magnetometer)")
+        return found
 
     def _likeliest(self):
         return bank.likeliest(bank.weights(self._state, self._par))

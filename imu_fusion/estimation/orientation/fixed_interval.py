@@ -55,11 +55,12 @@ def smooth(state: np.ndarray, par: np.ndarray, stamps: np.ndarray, samples: np.n
     passes = [_forward(state[k:k + 1], par[k:k + 1], logs, own[k], tapes)
               for k in range(len(own))]
     weight = bank.weights(state, par)
-    for k in np.flatnonzero(weight):
+    doubt = bank.doubts(state, par, weight)
+    for k in np.flatnonzero(weight + doubt):
         _smooth(state[k:k + 1], par[k:k + 1], logs, own[k], tapes, passes[k])
     written = int(passes[0][-1][1]["row"][0])
     if used > 1:
-        bank.mix_all(np.stack([part[:written] for part in own]), weight, rows)
+        bank.mix_all(np.stack([part[:written] for part in own]), weight, doubt, rows)
     return written
 
 
@@ -68,13 +69,20 @@ _Pass = list[tuple[np.ndarray, np.ndarray]]    # state and cursor before each se
 
 def _forward(state: np.ndarray, par: np.ndarray, logs: tuple[np.ndarray, ...], rows: np.ndarray,
              tapes: np.ndarray) -> _Pass:
-    """The filter of one hypothesis over the recording."""
-    cursor = np.zeros(1, CURSOR)
-    snapshots = []
-    while cursor["imu"][0] < len(logs[0]):
-        snapshots.append((state.copy(), cursor.copy()))
-        forward(state, par, *logs, cursor, rows, tapes)
-    return [*snapshots, (state, cursor)]
+    """The filter of one hypothesis over the recording. A rest that refutes a bias takes seconds to
+    do so: it is run again, knowing of that rest from its beginning."""
+    start, known = state.copy(), state["rest"]["refuting"].copy()
+    while True:
+        cursor = np.zeros(1, CURSOR)
+        snapshots = []
+        while cursor["imu"][0] < len(logs[0]):
+            snapshots.append((state.copy(), cursor.copy()))
+            forward(state, par, *logs, cursor, rows, tapes)
+        if (state["rest"]["refuting"] == known).all():
+            return [*snapshots, (state, cursor)]
+        known = state["rest"]["refuting"].copy()
+        state[:] = start
+        state["rest"]["refuting"] = known
 
 
 def _smooth(state: np.ndarray, par: np.ndarray, logs: tuple[np.ndarray, ...], rows: np.ndarray,

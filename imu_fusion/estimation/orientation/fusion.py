@@ -6,6 +6,10 @@ update corrects it with what the modules of ``measurements`` observe.
 Slow states beside the attitude: gyroscope bias, scale and misalignment, accelerometer
 bias, the magnetometer's offset, matrix and lag. A gyroscope axis at its limit gets two
 for what it does not show (clipped_rate).
+
+This file is the order in which things are done (:func:`step`, :func:`correct`). What is done lies
+beside it: first_state, prediction, measurements, error_state (the algebra), rest_detection,
+forgetting, output.
 """
 
 import math
@@ -14,15 +18,18 @@ import numpy as np
 
 from imu_fusion.estimation.orientation import (
     clipped_rate,
+    forgetting,
     gyro_limit,
     imu_rejection,
     mag_queue,
+    output,
+    prediction,
     rotation_history,
     spike,
     wander,
 )
 from imu_fusion.estimation.orientation import error_state as es
-from imu_fusion.estimation.orientation.alignment import Alignment
+from imu_fusion.estimation.orientation.gyro_model import rate_of_turn
 from imu_fusion.estimation.orientation.measurements import (
     back_in_range,
     bounded_motion,
@@ -32,26 +39,15 @@ from imu_fusion.estimation.orientation.measurements import (
 from imu_fusion.estimation.orientation.motion_scale import motion_scale
 from imu_fusion.estimation.orientation.rest_detection import is_still, refuted_turn
 from imu_fusion.estimation.orientation.rows import (
-    FLAG_ALIGNING,
-    FLAG_GAP,
     FLAG_HELD,
     FLAG_MAG_DISTURBED,
     FLAG_MAG_USED,
-    FLAG_NO_HEADING,
     FLAG_SATURATED,
     FLAG_STILL,
     SATURATED_AXES_SHIFT,
-    raise_to_limits,
-    write_attitude,
 )
 from imu_fusion.estimation.orientation.state import MAG_SUM
-from imu_fusion.geometry.rotation import (
-    quat_exp,
-    quat_multiply,
-    quat_normalize,
-    quat_rotate,
-    quat_to_matrix,
-)
+from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
 from imu_fusion.kernels import njit
 
 _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag is believed
@@ -59,47 +55,9 @@ _LAG_SDS = 3.0             # standard deviations within which a magnetometer lag
 # two whole blocks.
 _BURST_SHARE = 0.1
 _DISTURBED = 0.5           # weight (10) below which a sample is flagged as disturbed
-_STILL_LOCAL_RATE = 1e-3   # 1/s: at rest the local field is forgotten in a quarter of an hour
-_BIAS_SD_FLOOR = 2e-4      # rad/s: a first second at rest shows no bias better than that
-_REST_SD = 0.01            # m/s and m: velocity and position at a start at rest
-_LASTING_TIME = 10.0       # s, of accelerations that last in imu axes, such as those of turns
-_REST_LASTING_TIME = 0.3   # s: at rest they are over
-_FIRST_DT = 1e-2           # s: step that stands in for the one before the first sample
 _NO_FIELD = 1e-9           # of its norm: a field without a horizontal part
 _NO_BLOCK = np.zeros(1, es.PREDICTION)
 _NO_SUM = np.zeros(1, MAG_SUM)
-
-
-def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None:
-    """Start from an Alignment. state (1,): zeroed; par (1,): of kernel_parameters."""
-    s, p, a = state[0], par[0], alignment
-    if p["lasting_acc_sd"] > 0.0 and not a.at_rest:
-        # Where tilt and bias begin unknown, too, it explains what it should not.
-        s["log_likelihood"] = -math.inf
-    s["gyro_bias"] = a.gyr_bias
-    s["gravity"] = a.gravity
-    s["heading_var"] = es.UNIFORM_VARIANCE
-    s["rest"]["mean_rate"] = a.gyr_bias
-    sd = np.zeros(es.N)
-    sd[es.ATTITUDE:es.ATTITUDE + 2] = math.sqrt(a.cov_attitude_world[0, 0])
-    bias_sd = a.gyr_bias_sd if a.at_rest else p["sensor"]["gyro_bias_sd"]
-    sd[es.GYRO_BIAS:es.GYRO_SCALE] = max(bias_sd, _BIAS_SD_FLOOR)
-    sd[es.GYRO_SCALE:es.VELOCITY] = p["sensor"]["gyro_scale_sd"]
-    sd[es.VELOCITY:es.POSITION] = _REST_SD if a.at_rest else p["fusion"]["velocity_sd"]
-    sd[es.POSITION:es.FIELD] = _REST_SD if a.at_rest else p["fusion"]["position_sd"]
-    sd[es.MAG_OFFSET:es.ACC_BIAS] = p["fusion"]["mag_offset_sd"]
-    sd[es.ACC_BIAS:es.MAG_LAG] = p["sensor"]["acc_bias_sd"]
-    sd[es.MAG_LAG] = p["mag_delay_sd"]
-    sd[es.MAG_MATRIX:es.CLIPPED_RATE] = p["fusion"]["mag_matrix_sd"]
-    s["cov"] = np.diag(sd ** 2)
-    if a.field_world is not None:
-        follow = 1.0 if p["follows_field"] or not a.at_rest else 0.0
-        _start_field(state, par, a.field_world, a.has_heading, follow)
-
-
-@njit
-def _start_field(state, par, z, has_heading, follow):
-    magnetometer.start_field(state[0], par[0], (z[0], z[1], z[2]), has_heading, follow)
 
 
 @njit
@@ -122,7 +80,7 @@ def step(s, p, stamp, sample, row, tape):
     _begin_step(s, p, stamp, sample)
     _carry(s, p)
     if s.step.dt > p.gap.max:
-        _allow_for_gap(s, p)
+        forgetting.allow_for_gap(s, p)
     _take_mags(s, p)
     s.step.still = is_still(s, p)
     if s.step.still:
@@ -130,7 +88,7 @@ def step(s, p, stamp, sample, row, tape):
     elif s.rest.settled:
         turned = refuted_turn(s, p)
         if turned > 0.0:
-            _realign(s, p, turned)
+            forgetting.realign(s, p, turned)
     result = 1
     length = p.fusion.block * (_BURST_SHARE if s.clipped else 1.0)
     if s.step.back or s.block.time >= length - 1e-6:
@@ -140,7 +98,7 @@ def step(s, p, stamp, sample, row, tape):
     for i in range(3):
         s.gyr_last[i] = s.step.gyr[i]
         s.force_last[i] = s.step.force[i]
-    _write(s, p, row, len(tape) > 0)
+    output.write(s, p, row, len(tape) > 0)
     return result
 
 
@@ -183,24 +141,12 @@ def _begin_step(s, p, stamp, sample):
 
 
 @njit
-def _rate(s, gyr):
-    """Rate of turn, a tuple, from a raw one, with bias, scale and clipped rate."""
-    bias, clipped, scale = s.gyro_bias, s.clipped_rate, s.gyro_scale
-    return (gyr[0] - bias[0] + clipped[0] + scale[0, 0] * gyr[0] + scale[0, 1] * gyr[1]
-            + scale[0, 2] * gyr[2],
-            gyr[1] - bias[1] + clipped[1] + scale[1, 0] * gyr[0] + scale[1, 1] * gyr[1]
-            + scale[1, 2] * gyr[2],
-            gyr[2] - bias[2] + clipped[2] + scale[2, 0] * gyr[0] + scale[2, 1] * gyr[1]
-            + scale[2, 2] * gyr[2])
-
-
-@njit
 def _carry(s, p):
     """Attitude over the step: trapezoidal rates with the coning term."""
     step = s.step
-    rate_last = _rate(s, s.gyr_last)
+    rate_last = rate_of_turn(s, s.gyr_last)
     clipped_rate.carry(s, p)
-    rate = _rate(s, step.gyr)
+    rate = rate_of_turn(s, step.gyr)
     back = step.back
     if back:    # those axes show their rates again
         rate = (rate[0] - (back & 1) * s.clipped_rate[0],
@@ -212,78 +158,7 @@ def _carry(s, p):
     turn = quat_exp(phi, 1.0)
     s.quat_world_imu[:] = quat_normalize(quat_multiply(s.quat_world_imu, turn))
     rotation_history.push(s.history, s.stamp, turn)
-    _collect(s, p, middle)
-
-
-@njit
-def _collect(s, p, middle):
-    """Velocity and position over the step, and the block's integrals, at the attitude (3, 3) of
-    its middle."""
-    step, block = s.step, s.block
-    dt = step.dt
-    for i in range(3):
-        force = 0.0
-        for j in range(3):
-            f = 0.5 * (step.force[j] + s.force_last[j]) - s.acc_bias[j]
-            force += middle[i, j] * (f * dt + step.missed_force[j])
-            block.rotation[i, j] += middle[i, j] * dt
-            if (s.clipped >> j) & 1:
-                part = 0.5 if ((step.begun | step.back) >> j) & 1 else 1.0
-                block.clipped_rotation[i, j] += part * middle[i, j] * dt
-            for c in range(3):
-                block.rotation_gyr[i, 3 * j + c] += (
-                    middle[i, j] * 0.5 * (s.gyr_last[c] + step.gyr[c]) * dt)
-        change = 0.0
-        if p.use_acc:
-            block.force[i] += force
-            change = force - (s.gravity * dt if i == 2 else 0.0)
-        s.position[i] += (s.velocity[i] + 0.5 * change) * dt
-        s.velocity[i] += change
-    block.time += dt
-
-
-@njit
-def _allow_for_gap(s, p):
-    """Nothing is known of the motion in a gap."""
-    s.step.flags |= FLAG_GAP
-    s.counts.gaps += 1
-    s.rest.since = s.rest.changed = s.stamp
-    s.rest.settled = 0
-    unseen = min((p.gap.rate_sd * s.step.dt) ** 2, es.UNIFORM_VARIANCE)
-    for i in range(3):
-        s.block.noise[es.ATTITUDE + i] += unseen
-    _forget_motion(s, p)
-
-
-@njit
-def _realign(s, p, turned):
-    """A rest has refuted bias and attitude: what is known of them, and of what they were thought to
-    show, begins anew. turned: rad, what the bias has turned the attitude by in this rest alone."""
-    s.counts.realigned += 1
-    rest, noise = s.rest, s.block.noise
-    force = rest.mean_force
-    up = quat_rotate(s.quat_world_imu, (force[0], force[1], force[2]))
-    unsure = (up[0] ** 2 + up[1] ** 2) / (up[0] ** 2 + up[1] ** 2 + up[2] ** 2) + turned ** 2
-    for i in range(3):
-        noise[es.ATTITUDE + i] += unsure
-        noise[es.GYRO_BIAS + i] += (rest.mean_rate[i] - s.gyro_bias[i]) ** 2
-        noise[es.ACC_BIAS + i] += p.sensor.acc_bias_sd ** 2
-        for j in range(3):
-            noise[es.GYRO_SCALE + 3 * i + j] += p.sensor.gyro_scale_sd ** 2
-    _forget_motion(s, p)
-    rest.changed = s.stamp
-    rest.settled = 0
-
-
-@njit
-def _forget_motion(s, p):
-    """Start velocity and position anew."""
-    noise = s.block.noise
-    for i in range(3):
-        noise[es.VELOCITY + i] += p.fusion.velocity_sd ** 2
-        noise[es.POSITION + i] += p.fusion.position_sd ** 2
-        s.velocity[i] = 0.0
-        s.position[i] = 0.0
+    prediction.collect(s, p, middle)
 
 
 @njit
@@ -313,7 +188,7 @@ def _take_mags(s, p):
 @njit
 def _end_block(s, p, tape):
     """Prediction and updates over the collected block."""
-    _finish_prediction(s, p)
+    prediction.finish(s, p)
     if len(tape):
         tape[0].count = 0
         tape[0].prediction = s.block
@@ -338,48 +213,6 @@ def _end_block(s, p, tape):
     s.block = _NO_BLOCK[0]
     s.mag_sum = _NO_SUM[0]
     s.was_clipped = s.clipped & ~s.step.back
-
-
-@njit
-def _finish_prediction(s, p):
-    """Process noise and decays of the block."""
-    block, f = s.block, p.fusion
-    noise, time = block.noise, block.time
-    keep = math.exp(-time * (_STILL_LOCAL_RATE if s.step.still else 1.0 / f.local_field_time))
-    block.local_field_keep = keep
-    block.acc_bias_keep, lasting_var = _lasting(s, p)
-    block.acc_keep = math.exp(-time / f.angular_acc_time)
-    block.rate_gain = clipped_rate.gain(p, time)
-    if time > 0.0:
-        block.rate_mean = f.angular_acc_time * (1.0 - block.rate_gain / time)
-    acc_var, rate_var = clipped_rate.noise(p, time)
-    block.states = es.N if s.clipped else es.CLIPPED_RATE
-    for i in range(3):
-        lasting = ((s.clipped & s.was_clipped) >> i) & 1
-        block.stays_clipped[i] = lasting
-        noise[es.ATTITUDE + i] += p.sensor.gyro_noise_density ** 2 * time
-        noise[es.GYRO_BIAS + i] += p.sensor.gyro_bias_walk ** 2 * time
-        noise[es.VELOCITY + i] += f.velocity_walk ** 2 * time
-        noise[es.FIELD + i] = f.field_walk ** 2 * time
-        noise[es.ACC_BIAS + i] += lasting_var
-        s.acc_bias[i] *= block.acc_bias_keep
-        noise[es.LOCAL_FIELD + i] = p.local_field_sd ** 2 * (1.0 - keep * keep)
-        if lasting:
-            noise[es.ANGULAR_ACC + i] = acc_var
-            noise[es.CLIPPED_RATE + i] = rate_var
-        s.local_field[i] *= keep
-
-
-@njit
-def _lasting(s, p):
-    """Factor that the accelerometer's bias keeps over the block, and the variance that it gains:
-    where accelerations last in imu axes it is theirs, too (Gauss-Markov)."""
-    if p.lasting_acc_sd == 0.0:
-        return 1.0, 0.0
-    still = s.step.still
-    keep = math.exp(-s.block.time / (_REST_LASTING_TIME if still else _LASTING_TIME))
-    sd = p.sensor.acc_bias_sd if still else p.lasting_acc_sd
-    return keep, sd ** 2 * (1.0 - keep * keep)
 
 
 @njit
@@ -447,49 +280,3 @@ def _add_error(s, p, error):
     bound = _LAG_SDS * p.mag_delay_sd
     if bound > 0.0:
         s.mag_lag = min(max(s.mag_lag, -bound), bound)
-
-
-@njit
-def _write(s, p, row, taped):
-    """The output row of the present state. taped: the smoother will correct it."""
-    step, cov = s.step, s.cov
-    noise_dt = step.dt if step.dt > 0.0 else _FIRST_DT
-    since = s.block.time
-    density2 = p.sensor.gyro_noise_density ** 2
-    cov_world = np.empty((3, 3))
-    rate = _rate(s, step.gyr)
-    var_acc = p.sensor.acc_noise_density ** 2 / noise_dt + cov[es.ACC_BIAS, es.ACC_BIAS]
-    row.stamp = s.stamp
-    for i in range(3):
-        bias_var = cov[es.GYRO_BIAS + i, es.GYRO_BIAS + i]
-        var_gyr = density2 / noise_dt + bias_var
-        for j in range(3):
-            slot = es.GYRO_SCALE + 3 * i + j
-            var_gyr += cov[slot, slot] * step.gyr[j] ** 2
-            cov_world[i, j] = cov[i, j]
-            row.cov_gyr[i, j] = row.cov_acc[i, j] = 0.0
-        cov_world[i, i] += density2 * since + s.block.noise[es.ATTITUDE + i]
-        if (s.clipped >> i) & 1:
-            var_gyr += (cov[es.CLIPPED_RATE + i, es.CLIPPED_RATE + i]
-                        + s.block.noise[es.CLIPPED_RATE + i]
-                        + since ** 2 * cov[es.ANGULAR_ACC + i, es.ANGULAR_ACC + i])
-        row.gyr[i] = rate[i]
-        row.cov_gyr[i, i] = var_gyr
-        row.acc[i] = step.acc[i]
-        if p.lasting_acc_sd == 0.0:    # else it is mostly motion
-            row.acc[i] -= s.acc_bias[i]
-        row.cov_acc[i, i] = var_acc
-        row.gyr_bias[i] = s.gyro_bias[i]
-        row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
-    wander.widen(cov_world, wander.shown(s.wander))
-    cov_world[2, 2] += s.heading_var
-    if not taped:    # else the smoother does it, after its correction
-        raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)
-    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)
-    row.reliability = step.reliability
-    row.mag_count = step.mag_count
-    if not s.heading_known:
-        step.flags |= FLAG_NO_HEADING
-    if s.stamp <= s.align_until:
-        step.flags |= FLAG_ALIGNING
-    row.flags = step.flags

@@ -11,6 +11,7 @@ import numpy as np
 
 from imu_fusion.estimation.orientation import (
     bank,
+    first_state,
     fusion,
     gyro_limit,
     gyro_mag,
@@ -36,7 +37,7 @@ def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None
         gyro_mag.initialise(state, alignment)
     else:
         for k in range(len(state)):
-            fusion.initialise(state[k:k + 1], par[k:k + 1], alignment)
+            first_state.initialise(state[k:k + 1], par[k:k + 1], alignment)
 
 
 @njit

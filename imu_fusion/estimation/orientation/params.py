@@ -71,8 +71,8 @@ class AlignmentParams(Parameters):
             "uncalibrated magnetometer in a field that is the same everywhere.")
     heading_sd_deg: float = param(
         1.0, unit="deg", low=0, high=180,
-        doc="Uncertainty of the heading that the first interval shows. Raise it where that is "
-            "spent beside iron.")
+        doc="Uncertainty of the heading that the first interval shows, and of north where the "
+            "heading follows the field. Raise it beside iron and in buildings.")
     yaw_offset_deg: float = param(
         0.0, unit="deg", low=-360, high=360,
         doc="Turns the orientation about the vertical, counter-clockwise from above: for a world "
@@ -293,8 +293,6 @@ class OrientationParams(Parameters):
             add("with mode 'smoothed'", "lag")
         if not self.fusion.use_acc:
             add("without fusion.use_acc", *_MOTION)
-        if self.alignment.heading_anchor == "field":
-            add("with alignment.heading_anchor 'field'", "alignment.heading_sd_deg")
         if self.sensor.gyro_delay is not None:
             add("with sensor.gyro_delay given", "sensor.gyro_delay_sd")
         if self.sensor.mag_delay is not None:

@@ -3,6 +3,7 @@
 import math
 
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.estimation.orientation.state import MOST_REFUTING
 from imu_fusion.kernels import njit
 
 REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
@@ -62,6 +63,9 @@ def refuted_turn(s, p):
     rest = s.rest
     if not p.use_acc or rest.settled == 0:
         return 0.0
+    for n in range(MOST_REFUTING):
+        if rest.refuting[n] == rest.settled:    # the smoother knows what is to come
+            return _SURE_TURN
     force = rest.mean_force
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     if abs(size - s.gravity) >= _FORCE_OFF * s.gravity:    # or there is none at all

@@ -12,6 +12,7 @@ from imu_fusion.estimation.orientation.error_state import PREDICTION, ROW, N
 from imu_fusion.sensors.saturation import FLAT_TOPS
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
+MOST_REFUTING = 4     # rests that are remembered
 QUEUE_LENGTH = 128    # samples that wait: at 1 kHz more than the largest delay, 0.1 s
 
 ROTATION_HISTORY = np.dtype([
@@ -47,6 +48,7 @@ REST = np.dtype([
     ("settled_force", "f8", 3),          # mean_force at that stamp
     ("settled_rate", "f8", 3),           # mean_rate, likewise
     ("turn", "f8", 3),                   # rad, that the rates less their bias make since then
+    ("refuting", "i8", MOST_REFUTING),   # ``settled`` of rests that refuted a bias; 0: no more
 ], align=True)
 """The rest detector (rest_detection)."""
 
@@ -130,6 +132,7 @@ STATE = np.dtype([
     ("stamp", "i8"),                     # of the newest Imu sample
     ("started", "?"),                    # whether there was one
     ("align_until", "i8"),               # stamp of the end of the first interval
+    ("began_in_motion", "?"),            # that it was no rest
     ("gyr_last", "f8", 3),               # raw, of the newest sample; a held rate's stand-in
     ("force_last", "f8", 3),             # raw, likewise
     ("history", ROTATION_HISTORY),

@@ -10,11 +10,13 @@ it only. A power of its mean square widens the attitude's covariance on output; 
 
 import math
 
+from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
 from imu_fusion.kernels import njit
 
 _TIME = 5.0            # s, of the low-pass: slower than the motion, faster than the tilt forgets
 _MEMORY = 10.0         # s, over which its square is judged
 _PRIOR = 2.0           # s, that white innovations count for before there are any
+_LOST = 9.0            # mean square of the tilt's above which nothing that is linear describes it
 TILT, HEADING = 0, 1   # of the mean squares
 # Powers of the mean square by which standard deviations grow: 0.5 where innovations keep all of an
 # error. Tilt is followed fast, heading slowly. Chosen on the phones of benchmarks/orientation_sets.
@@ -60,7 +62,8 @@ def shown(wander):
 
 @njit
 def widen(cov_world, squares):
-    """Widen an attitude's covariance (3, 3), world axes, in place, by mean squares (2,)."""
+    """Widen an attitude's covariance (3, 3), world axes, in place, by mean squares (2,). Where the
+    filter is lost, its heading may be any: a needle that was far off at the start, say."""
     tilt, heading = max(squares[TILT], 1.0), max(squares[HEADING], 1.0)
     if tilt == 1.0 and heading == 1.0:
         return
@@ -68,3 +71,11 @@ def widen(cov_world, squares):
     for i in range(3):
         for j in range(3):
             cov_world[i, j] *= factor[i] * factor[j]
+    if is_lost(squares):
+        cov_world[2, 2] += UNIFORM_VARIANCE
+
+
+@njit
+def is_lost(squares):
+    """Whether innovations wander by more than any error that the filter follows makes them."""
+    return squares[TILT] > _LOST

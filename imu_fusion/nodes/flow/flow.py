@@ -114,6 +114,7 @@ class Flow:
         if self._relays and any(not session.has_ended for session in self.sink.feeding()):
             self.source.lost += 1  # at least: its senders go on
         self.source.end(END)
+        self._listens = False  # nobody asks it again
         self.sink.leave()
         self.peers.part()
 

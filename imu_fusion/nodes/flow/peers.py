@@ -49,7 +49,7 @@ class Peers(dict[str, Peer]):
     """By instance. :meth:`look` compares them with the graph, :meth:`say` tells them of us.
 
     Attributes: ``own``, the topic of this node's state: its instance; ``participant``, how its
-    gids begin; ``problems``, texts: why the exit code is 1.
+    gids begin; ``problems``, texts: why the exit code is 3.
 
     Args:
         state: returns what there is to say.
@@ -77,7 +77,7 @@ class Peers(dict[str, Peer]):
             self._publisher.publish(state.message())
 
     def problem(self, text: str) -> None:
-        """Say what makes the exit code 1."""
+        """Say what makes the exit code 3."""
         self.problems.append(text)
         self.node.get_logger().error(text)
 

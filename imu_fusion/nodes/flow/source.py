@@ -234,6 +234,7 @@ class Source:
     def look(self, anew: bool = False) -> None:
         """Compare with the graph: who listens, who has come, who has gone."""
         self._look_around()
+        self._hear()
         if self.phase in (_JOINING, _OPEN):
             known = {p.instance for p in self.peers.values() if p.state and p.state.listens}
             if self.upstream is not None:
@@ -258,17 +259,7 @@ class Source:
         """Do what has become possible: open, send what waits, end, begin the next."""
         if self.phase == _LIVE:
             return
-        for instance, joined in self._answers().items():
-            name, before = self._takers.get(instance, ("", None))
-            if joined is None and before is not None and instance in self.peers:
-                joined = replace(before, finished=True)  # it has lost sight of us for a while
-            if joined is None:
-                continue
-            self._takers[instance] = name or self.peers[instance].name, joined
-            if (before is not None and joined.finished and not before.finished
-                    and self.phase in (_JOINING, _OPEN)):
-                self._miss(instance, "has left")
-                self.company.discard(instance)  # asked anew, if it is still there
+        self._hear()
         if self.phase == _JOINING and self._all_joined():
             self.phase = _OPEN
             self.peers.say()
@@ -282,6 +273,20 @@ class Source:
         if self.phase == _ENDED and all(j is not None and j.finished
                                         for j in self._answers().values()):
             self._close()
+
+    def _hear(self):
+        """What those who joined say now; who has finished before the end has left."""
+        for instance, joined in self._answers().items():
+            name, before = self._takers.get(instance, ("", None))
+            if joined is None and before is not None and instance in self.peers:
+                joined = replace(before, finished=True)  # it has lost sight of us for a while
+            if joined is None:
+                continue
+            self._takers[instance] = name or self.peers[instance].name, joined
+            if (before is not None and joined.finished and not before.finished
+                    and self.phase in (_JOINING, _OPEN)):
+                self._miss(instance, "has left")
+                self.company.discard(instance)  # asked anew, if it is still there and listens
 
     def _close(self):
         self.phase = _LIVE
@@ -313,7 +318,7 @@ class Source:
     def _waiting(self):
         """Those of the company that are not ready with the company as it is now."""
         return {instance for instance, joined in self._answers().items()
-                if joined is None or joined.version < self._version and not joined.finished}
+                if joined is None or joined.version < self._version}
 
     def _names(self):
         return {self.peers[i].name for i, j in self._answers().items() if j is not None}

@@ -211,7 +211,7 @@ def test_scales_that_are_off_are_in_what_is_stated_or_told(impact):
         assert told or (remarks == [] and nees < 6)
 
 
-def test_biases_beyond_their_sds_are_told(impact):
+def test_gyroscope_biases_beyond_their_sds_are_told(impact):
     rate = impact.omega + np.random.default_rng(0).normal(0.0, 0.02, impact.omega.shape)
     for bias, told in ((0.0, False), (0.3, True)):
         estimator = AccelerationFieldEstimator(PARAMS.replace(use_gyro=True), layout())

@@ -13,8 +13,8 @@ from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.samples.logs import MagLog
 from imu_fusion.simulation.going_round import Circles
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
+from test.estimation.orientation.errors import local_errors, rmse_deg, tilt_errors_deg
 from test.estimation.orientation.test_estimator import NOISY, feed, make
-from test.estimation.orientation.test_fusion import local_errors, rmse_deg, tilt_errors_deg
 
 
 def recording(local_sd, seed=4, duration=30.0):
@@ -119,7 +119,7 @@ def test_a_mixture_has_mean_and_covariance_of_both():
         row["cov_attitude"] = np.diag([1e-4, 4e-4, 9e-4])
         row["gyr_bias"], row["gyr_bias_sd"] = 0.01 * turn, 1e-3
     mixed = np.zeros(1, ORIENTATION_DTYPE)
-    bank.mix_all(rows[:, None], weight, mixed)
+    bank.mix_all(rows[:, None], weight, np.zeros(2), mixed)
     found = (base.inv() * Rotation.from_quat(mixed["quat_world_imu"][0])).as_rotvec()
     assert found == pytest.approx(0.75 * apart, abs=1e-9)
     spread = 0.25 * 0.75 * np.outer(apart, apart)
@@ -168,3 +168,40 @@ def test_a_magnetometer_does_no_more_harm_than_is_stated(local_sd, mode):
     turn = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
     cov = turn @ rows["cov_attitude"] @ turn.transpose(0, 2, 1)
     assert tilt < alone + np.degrees(np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]).mean()))
+
+
+@pytest.fixture(scope="module")
+def laps_from_the_first_sample_on():
+    sensors = Sensors(gyr_density=3e-4, acc_density=5e-3, gyr_bias=(0.01, -0.01, 0.005))
+    imu, _, truth, _ = simulate(Circles(seed=1), 50.0, rate=50.0, sensors=sensors, seed=1)
+    return imu[500:], truth[500:]
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+def test_of_laps_from_the_first_sample_on_the_covariance_knows(laps_from_the_first_sample_on, mode):
+    """2 m/s^2, 11.5 deg: a bias explains them as well, and the mean takes them for that."""
+    imu, truth = laps_from_the_first_sample_on
+    rows = make({"mode": mode}).run(imu)
+    turn = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
+    cov = turn @ rows["cov_attitude"] @ turn.transpose(0, 2, 1)
+    stated = np.degrees(np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]).mean()))
+    tilt = tilt_errors_deg(rows, truth)
+    assert np.sqrt((tilt ** 2).mean()) < 2.0 * stated and tilt.max() < 3.0 * stated
+    without = make({"mode": mode, "fusion.lasting_acc_sd": 0.0}).run(imu)
+    assert rows["quat_world_imu"] == pytest.approx(without["quat_world_imu"], abs=1e-12)
+
+
+def test_a_doubt_is_part_of_the_covariance_alone():
+    rows = np.zeros(2, ORIENTATION_DTYPE)
+    apart = np.array([0.0, 0.02, 0.0])
+    rows["quat_world_imu"] = [[0.0, 0.0, 0.0, 1.0],
+                              (Rotation.from_rotvec([0.0, 0.0, 1.0])
+                               * Rotation.from_rotvec(apart)).as_quat()]
+    rows["cov_attitude"] = 1e-4 * np.eye(3)
+    mixed = np.zeros(1, ORIENTATION_DTYPE)
+    bank.mix_all(rows[:, None], np.array([1.0, 0.0]), np.array([0.0, 0.5]), mixed)
+    assert mixed["quat_world_imu"][0] == pytest.approx([0.0, 0.0, 0.0, 1.0])
+    # Of the other one's vertical; how it has turned about that is no doubt of this kind.
+    cov = mixed["cov_attitude"][0] - 1e-4 * np.eye(3)
+    assert np.trace(cov) == pytest.approx(0.5 * 0.02 ** 2, rel=1e-3)
+    assert cov[2, 2] < 1e-9

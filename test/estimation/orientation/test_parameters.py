@@ -64,9 +64,11 @@ def test_yaw_offset_turns_the_world_about_the_vertical(resting):
     assert yaw[1] - yaw[0] == pytest.approx(30.0, abs=1e-6)
 
 
-def test_heading_sd_is_the_anchored_headings(resting):
-    variances = [world_covariances(run(resting, {"alignment.heading_sd_deg": sd}))[-1, 2, 2]
-                 for sd in (1.0, 5.0)]
+@pytest.mark.parametrize("anchor", ["rest", "field"])
+def test_heading_sd_is_that_of_the_first_heading_and_of_north(resting, anchor):
+    variances = [world_covariances(run(resting, {
+        "alignment.heading_sd_deg": sd, "alignment.heading_anchor": anchor}))[-1, 2, 2]
+        for sd in (1.0, 5.0)]
     assert variances[1] - variances[0] == pytest.approx(math.radians(5) ** 2 - math.radians(1) ** 2,
                                                         rel=1e-6)
 
@@ -219,7 +221,6 @@ def test_gaps_are_flagged_above_their_bound_and_widen_by_the_unseen_rate(moving)
     (PRINTED | {"sensor.gyro_scale_sd": 0.1}, "does nothing with gyro_mag.as_printed"),
     ({"mode": "smoothed", "lag": 1.0}, "'lag': does nothing with mode 'smoothed'"),
     ({"fusion": {"use_acc": False, "position_sd": 1.0}}, "does nothing without fusion.use_acc"),
-    ({"alignment": {"heading_anchor": "field", "heading_sd_deg": 3.0}}, "'field'; leave it out"),
     ({"sensor": {"mag_delay": 0.01, "mag_delay_sd": 0.1}}, "with sensor.mag_delay given"),
     ({"sensor": {"gyro_delay": 0.01, "gyro_delay_sd": 0.1}}, "with sensor.gyro_delay given"),
     ({"lag": 0.0}, "'lag': 0.0 is out of bounds"),

@@ -9,8 +9,8 @@ from imu_fusion.estimation.orientation.rows import FLAG_STILL
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.simulation.going_round import Circles
 from imu_fusion.simulation.rotation import GRAVITY, Sensors, Tumbling, simulate
+from test.estimation.orientation.errors import local_errors, tilt_errors_deg
 from test.estimation.orientation.test_estimator import feed, make
-from test.estimation.orientation.test_fusion import local_errors, tilt_errors_deg
 
 LENGTH = 30.0
 BIAS = np.array([0.12, -0.05, 0.03])
@@ -104,3 +104,13 @@ def test_a_body_that_feels_no_force_refutes_nothing():
     estimator = make({})
     assert len(estimator.run(imu)) == n
     assert estimator.summary()["realigned"] == 0
+
+
+def test_the_smoother_knows_a_rest_from_its_beginning(coming_to_rest):
+    """Live it takes seconds of it to tell that the bias was wrong."""
+    imu, _, truth, _ = coming_to_rest
+    begun = (imu.stamp > int((LENGTH - 6.0) * 1e9)) & (imu.stamp < int((LENGTH - 5.5) * 1e9))
+    changes = {"fusion.gyro_factor": 1.0, "fusion.lasting_acc_sd": 0.0}
+    tilt = {mode: tilt_errors_deg(make({"mode": mode, **changes}).run(imu), truth)[begun]
+            for mode in ("causal", "smoothed")}
+    assert tilt["causal"].min() > 5.0 and tilt["smoothed"].max() < 2.0

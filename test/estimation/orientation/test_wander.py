@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.estimation.orientation import wander
 from imu_fusion.estimation.orientation.state import WANDER
 from imu_fusion.kernels import njit
-from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
+from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
+from test.estimation.orientation.errors import local_errors, tilt_errors_deg
 from test.estimation.orientation.test_estimator import make
-from test.estimation.orientation.test_fusion import local_errors, tilt_errors_deg
 
 MODES = ("causal", "smoothed")
 
@@ -97,3 +97,20 @@ def test_white_innovations_do_not_wander_and_constant_ones_do(time):
     _feed(found, rng.normal(size=(n, 3)) + [1.0, 1.0, 0.0], time)
     assert found[0]["overall"][0] > 0.5 * 2 * 5.0 / time
     assert found[0]["overall"][1] < 2.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_filter_that_is_lost_says_that_its_heading_may_be_any(mode):
+    """A start in motion with hard iron of half the level field, seven times what is stated."""
+    imu, mag, truth, _ = simulate(
+        Tumbling(seed=0, rate_sd=1.5, rest=3.0), 35.0, rate=100.0, seed=0,
+        field_world=earth_field(48e-6, np.radians(65)),
+        sensors=Sensors(gyr_density=3e-4, acc_density=2e-3, mag_sd=4e-7,
+                        mag_offset=(9.5e-6, -2.2e-6, 3e-6)))
+    estimator = make({"mode": mode})
+    rows = estimator.run(imu[1000:], mag[1000:])
+    error = np.degrees(np.linalg.norm(local_errors(rows, truth[1000:]), axis=1))
+    assert error.max() > 90.0
+    assert "the heading may be any" in estimator.remarks()[-1]
+    known = slice(1500 if mode == "causal" else 0, None)    # live it takes some 10 s to show
+    assert within_3_sigma(rows[known], truth[1000:][known]) > 0.95

@@ -55,7 +55,7 @@ def start_field(s, p, z, has_heading, follow):
         cov[es.ATTITUDE + 2, es.ATTITUDE + 2] += follow
         s.heading_known = True
         s.is_anchored = follow == 0.0
-        s.heading_var = 0.0
+        s.heading_var = p.heading_sd ** 2
     _share_errors(s, p, b, has_heading, follow)
     judge_anchor(s, p)
 
@@ -103,7 +103,7 @@ def judge_anchor(s, p):
     turning has made it smaller.
     """
     if not s.is_anchored:
-        return
+        return    # start_field's
     hard, soft = p.fusion.mag_offset_sd ** 2, p.fusion.mag_matrix_sd ** 2
     one_pose = hard * soft / (hard + soft) if hard + soft > 0.0 else 0.0
     turned = 0.0
