@@ -9,6 +9,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from imu_fusion.errors import BagError, ImuFusionError, SampleError, TopicError
 from imu_fusion.kernels import announced_compiling
 from imu_fusion.messages.layouts import Decoded, Layout
@@ -31,6 +33,7 @@ Write = Callable[[str, str, int, bytes], object]
 Chosen = tuple[Stage, StageReport, Mapping[str, str]]
 """A stage that can run, its report, and its topics to those in the recording."""
 
+_REFUSALS = (ImuFusionError, np.linalg.LinAlgError)    # the latter: of values beyond all bounds
 _BLOCK = 4000    # messages read before the estimators take them
 
 Block = Mapping[tuple[str, Layout], Decoded]
@@ -70,7 +73,7 @@ class _Feed:
             self._hand_on(self._stream.take_decoded(found))
         except BagError:    # of the writer
             raise
-        except ImuFusionError as error:    # the other stages go on
+        except _REFUSALS as error:    # the other stages go on
             self._report.skipped = str(error)
 
     def finish(self) -> None:
@@ -91,7 +94,7 @@ class _Feed:
             report.remarks, report.detail = list(conclusion.remarks), conclusion.detail
         except BagError:    # of the writer
             raise
-        except ImuFusionError as error:    # the other stages go on
+        except _REFUSALS as error:    # the other stages go on
             report.skipped = str(error)
         finally:
             self._count()

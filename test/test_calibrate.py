@@ -150,6 +150,12 @@ def test_a_recording_that_never_rests_or_turns_is_refused(tmp_path):
         inertial.calibrate_recorded_accelerometer(bag)
     with pytest.raises(CalibrationError, match="2 turns"):
         inertial.calibrate_recorded_gyroscope(bag)
+    for count in (1, 2):
+        bag = write(tmp_path / f"{count} samples", stamp[:count], gyr, acc)
+        for calibrate in (inertial.calibrate_recorded_accelerometer,
+                          inertial.calibrate_recorded_gyroscope):
+            with pytest.raises(CalibrationError, match="no rest of a second"):
+                calibrate(bag)
 
 
 def test_both_estimators_see_calibrated_samples(by_hand, tmp_path):

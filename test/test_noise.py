@@ -7,6 +7,7 @@ import yaml
 from imu_fusion.calibrate.noise import noise_of, noise_parameters, recorded_noise
 from imu_fusion.errors import CalibrationError
 from imu_fusion.messages.convert import imu_message
+from imu_fusion.messages.layouts import IMU
 from imu_fusion.recordings.bag_writer import BagWriter
 from test.sources.test_exports import at_hand, convert
 
@@ -43,6 +44,15 @@ def test_white_noise_shows_no_walk_and_a_knock_is_said(tmp_path):
     assert sum("60 s show white noise" in text for text in remarks) == 2
     values = yaml.safe_load(noise_parameters(found, "bag"))["/**"]["ros__parameters"]
     assert values["sensor.gyro_noise_density"] == pytest.approx(1e-3 / np.sqrt(50), rel=0.15)
+
+
+def test_stamps_that_are_not_set_leave_no_samples(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(400):
+            writer.write("/imu/data_raw", IMU.msgtype,
+                         imu_message(0, "imu", np.zeros(3), [0.0, 0.0, 9.81]), i + 1)
+    with pytest.raises(CalibrationError, match="gyroscope: 1 usable samples; .*repeated stamp"):
+        recorded_noise(tmp_path / "bag")
 
 
 def test_a_static_log_of_an_avanode(tmp_path):

@@ -44,7 +44,7 @@ from imu_fusion.recordings.targets import METADATA_FILE
 _STORAGES: dict[str, type[Storage]] = {
     ".mcap": McapStorage, ".db3": SqliteStorage, ".bag": Ros1Storage}
 _LARGEST_RATIO = 1000      # of a file and what it unpacks to
-_PIECE = 1 << 20
+_PIECE = 1 << 17           # a block of zstd: what comes before a broken one is kept
 
 
 Lose = Callable[[str], object]
@@ -90,11 +90,11 @@ def open_bag(path: str | Path, description: str | Path | None = None,
                 reader.open_source(description)
             else:
                 reader.open(storage_files(path, reader.mention))
+        except ImuFusionError:
+            raise
         except (OSError, ValueError) as error:    # ValueError: a name that no file can have
-            if isinstance(error, ImuFusionError):
-                raise
             raise BagError(f"{path}: cannot be read ({error})") from None
-        except (MemoryError, RecursionError, ArithmeticError, LookupError, TypeError) as error:
+        except Exception as error:
             raise BagError(f"{path}: damaged beyond reading ({type(error).__name__}: {error})"
                            ) from error
         reader.rename(remap or {})

@@ -26,7 +26,8 @@ HEAD = struct.Struct("<BQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 _AGREE = 3                 # records in a row that are not there by chance
-_SEARCHES = 10             # for records in one chunk
+_PLACES = 1_000_000        # that are looked at in one file: they may be there on purpose
+_PLACES_IN_CHUNK = 10_000
 SEARCH = 1 << 20           # bytes that are looked through at once
 
 
@@ -98,22 +99,28 @@ def is_followed(file: Bytes, position: int, end: int) -> bool:
             and end + HEAD.size + length > file.size)   # the cut end of a file
 
 
-def find_record(file: Bytes, start: int) -> int:
-    """Position of the first record at or after ``start``, the size of the file without one."""
-    while start < file.size - HEAD.size:
-        data = file.read(start, SEARCH)
-        bytes_ = np.frombuffer(data, np.uint8)
-        count = len(bytes_) - HEAD.size + 1
-        opcode = bytes_[:count]
-        length = np.lib.stride_tricks.sliding_window_view(bytes_[1:], 8)[:count]
-        # The length fits into a file: its upper bytes are zero.
-        places = np.flatnonzero((opcode > 0) & (opcode <= _LAST)
-                                & (length[:, 5:] == 0).all(axis=1))
-        for place in places.tolist():
-            if _is_record(file, start + place):
-                return start + place
-        start += count
-    return file.size
+class Search:
+    """For the next record of a file where none follows, at no more than so many ``places``."""
+
+    def __init__(self, file: Bytes, places: int = _PLACES) -> None:
+        self._file, self._places = file, places
+
+    def after(self, start: int) -> int:
+        """Position of the first record at or after ``start``, the size of the file without one."""
+        while start < self._file.size - HEAD.size and self._places > 0:
+            bytes_ = np.frombuffer(self._file.read(start, SEARCH), np.uint8)
+            count = len(bytes_) - HEAD.size + 1
+            opcode = bytes_[:count]
+            length = np.lib.stride_tricks.sliding_window_view(bytes_[1:], 8)[:count]
+            # The length fits into a file: its upper bytes are zero.
+            places = np.flatnonzero((opcode > 0) & (opcode <= _LAST)
+                                    & (length[:, 5:] == 0).all(axis=1))
+            for place in places[:self._places].tolist():
+                self._places -= 1
+                if _is_record(self._file, start + place):
+                    return start + place
+            start += count
+        return self._file.size
 
 
 def _is_record(file: Bytes, position: int) -> bool:
@@ -134,7 +141,8 @@ def _is_record(file: Bytes, position: int) -> bool:
 def records(data: bytes) -> Iterator[tuple[int, memoryview]]:
     """(opcode, content) of the records of a chunk, as far as they are what may be in one: a chunk
     of zeros is no million of records. What is none comes with the opcode NONE."""
-    view, position, searches = memoryview(data), 0, 0
+    view, position = memoryview(data), 0
+    search = Search(Memory(data), _PLACES_IN_CHUNK)
     while position < len(data):
         opcode, length = (HEAD.unpack_from(data, position) if position + HEAD.size <= len(data)
                           else (NONE, 0))
@@ -143,10 +151,7 @@ def records(data: bytes) -> Iterator[tuple[int, memoryview]]:
             yield opcode, view[content:content + length]
             position = content + length
             continue
-        # Bounded: what looks like records that may not be in a chunk would be searched for ever.
-        searches += 1
-        following = (find_record(Memory(data), position + 1) if searches <= _SEARCHES
-                     else len(data))
+        following = search.after(position + 1)
         yield NONE, view[position:following]
         position = following
 

@@ -31,9 +31,9 @@ from imu_fusion.recordings.mcap_records import (
     SEARCH,
     Channel,
     Schema,
+    Search,
     define,
     end_of,
-    find_record,
     is_followed,
     records,
 )
@@ -95,6 +95,7 @@ class McapStorage(FileStorage):
         self._index_at: int | None = None    # its first record, once that has come
         self._holes: list[tuple[int, int, _Block]] = []   # (bytes, number of the block after, lost)
         self._lost: _Block | None = None    # a chunk that is no more, though its index may be
+        self._search = Search(self._file)
         self._walk()
         self._learn_channels()
         self._make_topics()
@@ -141,7 +142,7 @@ class McapStorage(FileStorage):
             position = start = block.position
         elif block is not None and block.compression is not None:
             block.forget()    # a part of its index may be missing
-        found = find_record(self._file, start)
+        found = self._search.after(start)
         if self._index_at is not None:
             self.mention(f"{self.path.name}: not closed properly: its index is damaged or cut off; "
                          "it is read without")

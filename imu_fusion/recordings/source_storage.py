@@ -38,8 +38,7 @@ def read_source(path: Path, source: Source) -> list[Block]:
         return [in_range(block, source) for block in blocks + source.finish()]
     except ImuFusionError:
         raise
-    except (MemoryError, RecursionError, ArithmeticError, LookupError, ValueError, TypeError,
-            AttributeError) as error:
+    except Exception as error:
         raise BagError(f"{path}: damaged beyond reading ({type(error).__name__}: {error})"
                        ) from error
 
@@ -65,7 +64,7 @@ class SourceStorage(Storage):
                  description: Mapping[str, Any] | None = None, described_in: str = "") -> None:
         super().__init__(path, lose, mention)
         source = (file_source(known, description, described_in) if known is not None else
-                  TableSource(Description.from_mapping(description, described_in)))
+                  TableSource(Description.from_mapping(description, described_in), where=str(path)))
         found: dict[str, list[Log]] = {}
         for topic, log, _ in read_source(path, source):
             if len(log):

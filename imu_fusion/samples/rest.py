@@ -29,6 +29,8 @@ def find_rests(imu: ImuLog, shortest: float = 1.0) -> list[Rest]:
     What is still is told from the quietest twentieth of the recording: a recording for a
     calibration holds more rest than that.
     """
+    if len(imu) < 3:
+        return []
     time = seconds(imu.stamp, imu.stamp[0])
     step = float(np.median(np.diff(time)))
     width = max(int(round(_WINDOW / step)), 3)

@@ -330,6 +330,8 @@ def _other_axes(verdict, name):
 
 def _stuck(imu, mag, name):
     """A finding on a magnetometer that does not change while the body turns."""
+    if not np.isfinite(mag.mag).any(axis=0).all():
+        return []
     norm = np.linalg.norm(np.nanmean(mag.mag, axis=0))
     if not np.nanstd(mag.mag, axis=0).max() < _STUCK * norm:
         return []

@@ -152,7 +152,10 @@ def locations(stamp: np.ndarray, values: np.ndarray) -> list[Block]:
 
 def _metadata(part: str, data: bytes) -> dict[str, str]:
     lines = data.decode("utf-8-sig", "replace").splitlines()[:2]
-    rows = list(csv.reader(lines))
+    try:
+        rows = list(csv.reader(lines))
+    except csv.Error:    # a cell that is too long
+        rows = []
     return {k.strip(): v for k, v in zip(*rows)} if len(rows) == 2 else {}
 
 

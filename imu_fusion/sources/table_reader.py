@@ -18,7 +18,8 @@ GPS_EPOCH = 315_964_800    # 1980-01-06 in Unix time
 _WEEK = 7 * 86400
 _DIGITS = 22           # of nanoseconds, with room
 _MANY = 1000           # broken rows, after which the share is looked at before the end
-_NO_TEXT = "not a table of text: zeros, or carriage returns that end no line, are in it"
+_NO_TEXT = ("not a table of text: zeros, carriage returns that end no line, or quotes without end "
+            "are in it")
 Result = TypeVar("Result")
 
 
@@ -172,8 +173,9 @@ class TableReader:
         for line, text in lines:
             if line <= table.skip_lines or (table.comment and text.startswith(table.comment)):
                 continue
-            no_text = "\0" in text or "\r" in text
-            cells = [] if no_text else self._cells(text)
+            cells = self._cells(text)
+            no_text = cells is None
+            cells = cells or []
             if not any(cells) and not no_text:
                 continue
             if no_text and self.names is None:
@@ -193,12 +195,19 @@ class TableReader:
         self._count += len(rows.lines)
         return rows
 
-    def _cells(self, text: str) -> list[str]:
+    def _cells(self, text: str) -> list[str] | None:
+        """Those of a line; None if it is none of a table."""
+        if "\0" in text or "\r" in text:
+            return None
         if self._delimiter is None:
             return text.split()
         if '"' not in text:
             return [cell.strip() for cell in text.split(self._delimiter)]
-        return [cell.strip() for cell in next(csv.reader([text], delimiter=self._delimiter), [])]
+        try:
+            found = next(csv.reader([text], delimiter=self._delimiter), [])
+        except csv.Error:    # of a cell that is too long
+            return None
+        return [cell.strip() for cell in found]
 
 
 def _stamp(where: str, line: int, text: str, week: float, time: TimeParams) -> int:

@@ -1,6 +1,7 @@
 """Hostile recordings: what a file claims is not believed, and nothing of it is carried out. Broken
 files of each kind by the thousand: ``python -m benchmarks.fuzz``."""
 
+import contextlib
 import random
 import shutil
 import sqlite3
@@ -12,10 +13,12 @@ import pytest
 import zstandard
 
 from benchmarks.fuzz import KINDS, mutated, outcome, write_db3
-from imu_fusion.errors import INCOMPLETE
+from imu_fusion.errors import INCOMPLETE, ImuFusionError
 from imu_fusion.messages.layouts import IMU, MAG
 from imu_fusion.recordings import mcap_records, ros1_records
 from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.streams.registry import STAGES
+from imu_fusion.surfaces.file import load_surface
 from test.recordings.doors import rows_of, run, through
 from test.recordings.raw_mcap import channel, chunk, in_chunk, mcap, message, schema, text
 from test.recordings.test_bag import START, STEP, imu, write
@@ -179,3 +182,23 @@ def test_every_collected_file_is_read_or_refused_in_a_line(tmp_path, file):
         if result.exit_code == 1:
             (line,) = [t for t in result.output.splitlines() if t.startswith("imu_fusion: ")]
             assert file.name in line or file.parent.name in line
+
+
+@pytest.mark.skipif(not HOSTILE.exists(), reason="the collection is not there")
+@pytest.mark.parametrize("table", sorted(HOSTILE.glob("csv/*.csv")), ids=lambda p: p.stem)
+def test_every_collected_table_is_read_or_refused_in_a_line(tmp_path, table):
+    result = run("convert", table, tmp_path / "out", "--description", table.with_suffix(".yaml"))
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert (tmp_path / "out").exists() == (result.exit_code != 1)
+    if result.exit_code == 1:
+        (line,) = [t for t in result.output.splitlines() if t.startswith("imu_fusion: ")]
+        assert table.stem in line or "known: " in line
+
+
+@pytest.mark.skipif(not HOSTILE.exists(), reason="the collection is not there")
+@pytest.mark.parametrize("file", sorted(HOSTILE.glob("csv/*.*.yaml")), ids=lambda p: p.stem)
+def test_every_collected_parameter_or_surface_file_is_read_or_refused(file):
+    for read in ([load_surface] if ".surface." in file.name else
+                 [stage.prepare for stage in STAGES.values()]):
+        with contextlib.suppress(ImuFusionError):
+            read(file)

@@ -30,7 +30,7 @@ def counts(path):
 
 
 @pytest.mark.parametrize("kind", TEXTS)
-@pytest.mark.parametrize("damage", ["zeros", "junk", "two in one", "cut"])
+@pytest.mark.parametrize("damage", ["zeros", "junk", "two in one", "a quote without end", "cut"])
 def test_a_broken_line_costs_itself(tmp_path, kind, damage):
     file = write_device(kind, tmp_path)
     before, lost = counts(file)
@@ -43,6 +43,7 @@ def test_a_broken_line_costs_itself(tmp_path, kind, damage):
         line = lines[at]
         lines[at] = {"zeros": line[:3] + bytes(len(line) - 4) + line[-1:],
                      "junk": b",".join([b"?"] * 3 + line.split(b",")[3:]),
+                     "a quote without end": b'"' + b"1" * 200_000 + line[-1:],
                      "two in one": line.rstrip(b"\r\n") + b","}[damage]
     file.write_bytes(b"".join(lines))
     after, lost = counts(file)

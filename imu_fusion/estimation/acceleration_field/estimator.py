@@ -89,7 +89,7 @@ class AccelerationFieldEstimator:
         self._readings: list[np.ndarray] = []
         self._late: list[np.ndarray] = []    # rows of mode smoothed before its first sample
         self._limits = RangeLimits(self.array)
-        self._standing = StandingAxes(self.array)
+        self._standing = StandingAxes(self.params, self.array)
 
     def sensor_fits(self) -> list[SensorFit]:
         """How each accelerometer fits to the others, by the samples so far (or by those that
@@ -137,7 +137,7 @@ class AccelerationFieldEstimator:
         return {"filter": None if self._filter is None else self._filter.get_state(),
                 "start": self._start, "rest": self._rest, "last": self._last, "waits": self._waits,
                 "limits": (self._limits.found.copy(), self._limits.steps.copy()),
-                "standing": self._standing.found.copy(),
+                "standing": (self._standing.found.copy(), self._standing.others.copy()),
                 "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
 
@@ -147,7 +147,7 @@ class AccelerationFieldEstimator:
         self._waits = state["waits"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
         self._limits.found, self._limits.steps = (part.copy() for part in state["limits"])
-        self._standing.found = state["standing"].copy()
+        self._standing.found, self._standing.others = (part.copy() for part in state["standing"])
         self._late = list(state["late"])
         self._filter = None
         if state["filter"] is not None:
@@ -203,7 +203,7 @@ class AccelerationFieldEstimator:
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
         limits = RangeLimits(self.array)
         limits.mark(readings)    # first what the whole recording tells of them
-        standing = StandingAxes(self.array)
+        standing = StandingAxes(self.params, self.array)
         readings = standing.mark(self._channels(limits.mark(readings)))
         params = self.params
         if params.maximum_likelihood != "off":

@@ -199,6 +199,6 @@ def _correct_row(row, p, error, cov, final, limits, dt):
                                  + cov[_BIAS + i, _BIAS + i])
     raise_to_limits(gyr, clipped, limits)
     cov_world = cov[:3, :3].copy()    # other rows share cov
-    wander.widen(cov_world, final.wander.overall)
+    wander.widen(cov_world, final.wander.overall, final.wander.overall)
     cov_world[2, 2] += final.heading_var
     write_cov_attitude(row, p, cov_world, quat_to_matrix(quat), dt)

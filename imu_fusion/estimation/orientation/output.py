@@ -50,7 +50,7 @@ def write(s, p, row, taped):
         row.cov_acc[i, i] = var_acc
         row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
-    wander.widen(cov_world, wander.shown(s.wander))
+    wander.widen(cov_world, wander.shown(s.wander), s.wander.overall)
     cov_world[2, 2] += s.heading_var
     if not taped:    # else the smoother does it, after its correction
         raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)

@@ -61,9 +61,10 @@ def shown(wander):
 
 
 @njit
-def widen(cov_world, squares):
+def widen(cov_world, squares, overall):
     """Widen an attitude's covariance (3, 3), world axes, in place, by mean squares (2,). Where the
-    filter is lost, its heading may be any: a needle that was far off at the start, say."""
+    filter is lost by what they were ``overall``, its heading may be any: a needle that was far off
+    at the start, say."""
     tilt, heading = max(squares[TILT], 1.0), max(squares[HEADING], 1.0)
     if tilt == 1.0 and heading == 1.0:
         return
@@ -71,11 +72,12 @@ def widen(cov_world, squares):
     for i in range(3):
         for j in range(3):
             cov_world[i, j] *= factor[i] * factor[j]
-    if is_lost(squares):
+    if is_lost(overall):
         cov_world[2, 2] += UNIFORM_VARIANCE
 
 
 @njit
-def is_lost(squares):
-    """Whether innovations wander by more than any error that the filter follows makes them."""
-    return squares[TILT] > _LOST
+def is_lost(overall):
+    """Whether innovations have wandered by more than any error that the filter follows makes
+    them, by their mean squares (2,) so far."""
+    return overall[TILT] > _LOST

@@ -65,7 +65,8 @@ def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarr
         start: (3,) m, the first position where it is given; else that of the first fix.
 
     Raises:
-        EstimationError: no start, and no fix within the Imu samples.
+        EstimationError: no start, and no fix within the Imu samples; a force that tells no
+            attitude.
     """
     kind, value = problem.readings["kind"], problem.readings["value"]
     if start is None and not np.any(kind == FIX):
@@ -84,7 +85,12 @@ def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarr
             early = mag.between(log.stamp[0], last + 1)
             finite = np.isfinite(early.mag).all(axis=1)
             reading = early.mag[finite].mean(axis=0) if finite.any() else None
-        initial_quat = attitude_from_vectors(log.acc[:beginning].mean(axis=0), reading,
-                                             problem.around.magnetic_field)
+        with np.errstate(over="ignore"):
+            force = log.acc[:beginning].mean(axis=0)
+            known = 0.0 < np.linalg.norm(force) < np.inf
+        if not known:
+            raise EstimationError(f"the accelerometer reads {force} m/s^2 at the beginning, which "
+                                  "tells no attitude")
+        initial_quat = attitude_from_vectors(force, reading, problem.around.magnetic_field)
         candidates = _HEADINGS_BLIND if reading is None else _HEADINGS
     return problem.rank(headings(initial_quat, candidates))

@@ -229,16 +229,20 @@ def test_one_axis_that_stands_still_is_left_out(impact, mode):
     assert np.all(rows["flags"][250:] & LEFT_OUT > 0) and nees < 6 and error < 0.05
 
 
-@pytest.mark.parametrize("channels, found", [([5], [5]), ([3, 4, 5], [3, 4, 5]), ([2, 5, 8], [])])
-def test_only_what_stands_still_on_one_sensor_is_judged(channels, found):
+@pytest.mark.parametrize("channels, found", [
+    ([5], True), ([3, 4, 5], True), ([2, 9], True), ([2, 5, 8, 11], False), (range(12), False)])
+@pytest.mark.parametrize("begin, late", [(500, 20), (0, 200)])
+def test_few_axes_that_stand_still_are_judged_and_many_are_not(channels, found, begin, late):
     # Without noise, z of all sensors stands still where a body turns about z alone.
     array = make_sensor_array(list(layout().values()))
     readings = np.random.default_rng(0).standard_normal((1000, len(array.channels)))
-    readings[500:, channels] = readings[500, channels]
-    standing = StandingAxes(array)
+    readings[begin:, channels] = readings[begin, channels]
+    standing = StandingAxes(PARAMS, array)
     marked = np.concatenate([standing.mark(part.copy()) for part in np.array_split(readings, 7)])
-    assert np.flatnonzero(np.all(np.isneginf(marked[521:]), axis=0)).tolist() == found
-    assert np.isfinite(marked[:519]).all() and bool(standing.texts([*NAMES])) is bool(found)
+    out = np.zeros(readings.shape, bool)
+    out[begin + late:, channels] = found
+    assert np.array_equal(np.isneginf(marked), out)
+    assert bool(standing.texts([*NAMES])) is found
 
 
 def test_lost_samples_are_no_limit(impact):
@@ -291,6 +295,17 @@ def test_what_does_not_tell_the_angular_velocity_is_refused():
     with pytest.raises(LayoutError, match="angular velocity.*use_gyro|condition"):
         AccelerationFieldEstimator(PARAMS, sensors)
     AccelerationFieldEstimator(PARAMS.replace(use_gyro=True, max_condition=1e4), sensors)
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 4.0])
+def test_coarse_sensors_that_come_to_rest_are_not_taken_for_dead(impact, step):
+    # Of steps that are wider than the noise, some axes stand still at rest while others do not.
+    random = np.random.default_rng(0)
+    readings = np.concatenate([felt(impact), np.tile(felt(impact)[-1], (2000, 1, 1))])
+    readings[len(impact.t):] += random.normal(0.0, NOISE, (2000, 4, 3))
+    standing = StandingAxes(PARAMS, make_sensor_array(list(layout().values())))
+    marked = standing.mark(np.round(readings / step).reshape(-1, 12) * step)
+    assert np.isfinite(marked).all()
 
 
 def test_a_dead_sensor_does_not_spoil_the_start():

@@ -273,6 +273,10 @@ def test_what_cannot_be_estimated_says_so(jump, recording):
         smoother.run(imu[np.r_[0:50, 40:100]], mag, fix, velocity)
     with pytest.raises(SampleError, match="at least 10"):
         smoother.run(imu[:5], mag, fix, velocity)
+    for force in (0.0, 1e308):
+        with pytest.raises(EstimationError, match="tells no attitude"):
+            Smoother().run(dataclasses.replace(imu, acc=np.full_like(imu.acc, force)), mag, fix,
+                           velocity)
     later = dataclasses.replace(fix, stamp=fix.stamp + 10**12)
     with pytest.raises(EstimationError, match="within the Imu recording"):
         Smoother().run(imu, mag, later, velocity)
