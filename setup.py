@@ -26,7 +26,7 @@ docs = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
 test = ["ruff~=0.17.6", "mypy~=2.4.1", "types-PyYAML",
         "pytest>=7.4", "pytest-xdist>=3.5", "pytest-cov>=5",
         "hypothesis>=6", "openpyxl>=3.1", "colcon-common-extensions",
-        *devices, *report, *notebook, *terrain, *docs]
+        *devices, *report, *notebook, *terrain, *calibrate, *docs]
 
 # Read, not imported: nothing of the package is installed yet.
 nodes = run_path(f"{package_name}/nodes/__init__.py")["NODES"]

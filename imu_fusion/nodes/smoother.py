@@ -23,10 +23,10 @@ from imu_fusion.nodes.base import IDLE
 from imu_fusion.nodes.estimator import EstimatorNode
 from imu_fusion.nodes.flow import END, NAP_PATIENT, reliable_qos
 from imu_fusion.signals import end_after
-from imu_fusion.streams.smoother import INPUTS, SmootherStream, required_of, smooth
+from imu_fusion.streams.smoother import INPUTS, SmootherStream, frame_of, lacking, smooth
 from imu_fusion.streams.smoother_messages import ONCE, Outcome, messages, outputs_of
 from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
-from imu_fusion.streams.stream import IMU_TOPIC, EstimatorNodeParams, one_by_one
+from imu_fusion.streams.stream import EstimatorNodeParams, one_by_one
 from imu_fusion.surfaces.file import load_surface
 
 _POLL = 0.002  # s between callbacks while a child smooths, see work()
@@ -51,7 +51,7 @@ def _smooth_in_child(folder):
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smooth(params, logs)
         np.save(folder / _SAMPLES, result.samples)
-        outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
+        outcome = Outcome.of(result, frame_of(logs))
     except ImuFusionError as error:
         outcome = str(error)
     except KeyboardInterrupt:
@@ -153,7 +153,7 @@ class SmootherNode(EstimatorNode):
 
     def _on_begin(self, session):
         played = {self._names.get(topic) for topic in session.said.topics} & INPUTS.keys()
-        missing = [topic for topic in required_of(self._stream.params) if topic not in played]
+        missing = lacking(self._stream.params, played)
         if played and missing and self._at_end:
             raise TopicError(f"{session.source} plays no {' and no '.join(missing)}: there "
                              "will be nothing to smooth")

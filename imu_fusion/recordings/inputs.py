@@ -1,18 +1,20 @@
 """Where a recording holds the topics that somebody needs, and what to say if it does not."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.sources.source import ARRAY_TOPIC
 
 
-def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[str, str]
-                ) -> tuple[dict[str, str], str]:
+def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[str, str],
+                dispensable: Collection[str] = ()) -> tuple[dict[str, str], str]:
     """Where a recording holds topics.
 
     Args:
         reader: an open recording.
         required, optional: topic to message type.
+        dispensable: required topics that are done without where a recording holds nothing of their
+            type, so that none has another name.
 
     Returns:
         dict of our topic to its name in the recording, and words for required ones that it
@@ -30,6 +32,9 @@ def find_inputs(reader: Reader, required: Mapping[str, str], optional: Mapping[s
                 reader.mention(f"{why}; it is left out")
         else:
             names[topic] = name
+            continue
+        if topic in dispensable and not any(
+                t.msgtype == msgtype and t.count for t in reader.topics.values()):
             continue
         if topic in required:
             missing.append(f"{why}; {_instead(reader, topic, msgtype)}")

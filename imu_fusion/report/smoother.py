@@ -84,7 +84,10 @@ def smoother_sections(smoothed: Smoothed, reference: PoseLog | None = None) -> l
         sections.append(_jump(smoothed))
     if reference is not None:
         sections.append(_truth(smoothed, reference))
-    sections += [_velocity(smoothed), _attitude(smoothed), *_errors(smoothed)]
+    sections.append(_velocity(smoothed))
+    if smoothed.result.acc_density is None:
+        sections.append(_attitude(smoothed))
+    sections += _errors(smoothed)
     if smoothed.fix is not None:
         sections.append(_before_after(smoothed))
     if smoothed.result.innovations:
@@ -192,7 +195,8 @@ def _truth(smoothed, reference):
     panels, table = [], []
     for error, cov, scale, unit, names, what in (
             (position, rows["cov_position"], 1.0, "m", _ENU, "position"),
-            (attitude, rows["cov_attitude"], np.degrees(1.0), "°", _XYZ, "attitude about")):
+            (attitude, rows["cov_attitude"], np.degrees(1.0), "°", _XYZ, "attitude about"),
+            )[:1 if smoothed.result.acc_density is not None else 2]:
         sd = scale * _sd(cov)
         ratio = nees(error / scale, cov).mean()
         rms = np.sqrt(np.mean(error ** 2, axis=0))

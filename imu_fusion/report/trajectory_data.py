@@ -30,18 +30,18 @@ def read_result(reader: Reader) -> tuple[SmootherResult | None, list[str], str]:
         (SmootherResult, remarks, ''), or (None, [], why there is none). Biases of the sensors are
         not in a recording: NaN; nor are innovations: none.
     """
-    names = [reader.find(topic) for topic in (ODOMETRY_TOPIC, SMOOTHED_IMU_TOPIC, RESULTS_TOPIC)]
-    if None in names or not all(reader.topics[name].count for name in names if name):
-        return None, [], f"{reader.path.name} holds no trajectory on {ODOMETRY_TOPIC}"
-    odometry = readable_messages(reader, ODOMETRY_TOPIC, ODOMETRY)
-    imu = readable_messages(reader, SMOOTHED_IMU_TOPIC, IMU)
-    results = readable_messages(reader, RESULTS_TOPIC, results_value)
+    odometry, imu, results = (
+        readable_messages(reader, topic, form) if reader.find(topic) else [] for topic, form in (
+            (ODOMETRY_TOPIC, ODOMETRY), (SMOOTHED_IMU_TOPIC, IMU), (RESULTS_TOPIC, results_value)))
     found = results_value(results[-1]) if results else {}
+    felt = found.get("acc_density") is None    # by an Imu
+    if not odometry or not results or (felt and not imu):
+        return None, [], f"{reader.path.name} holds no trajectory on {ODOMETRY_TOPIC}"
     if "origin" not in found:
         return None, [], (f"{reader.path.name} does not say where its trajectory begins; an older "
                           "imu_fusion has written it: process the recording again")
     try:
-        samples = samples_of(odometry, imu)
+        samples = samples_of(odometry, imu if felt else None)
         if len(samples) == 0:
             raise ValueError(f"no stamps that {ODOMETRY_TOPIC} and {SMOOTHED_IMU_TOPIC} share")
         jump = JumpResult(**found["jump"]) if "jump" in found else None
@@ -49,21 +49,23 @@ def read_result(reader: Reader) -> tuple[SmootherResult | None, list[str], str]:
             samples, LocalFrame(**found["origin"]), _states(found["states"], len(samples)), {},
             (found["cost"],), found["iterations"], found["converged"], jump=jump,
             events=None if jump is None else JumpEvents(jump.takeoff_stamp, jump.touchdown_stamp),
-            gnss_lag=found["gnss_lag"]), found["remarks"], ""
+            gnss_lag=found["gnss_lag"], acc_density=found.get("acc_density")), found["remarks"], ""
     except (LookupError, TypeError, ValueError, AttributeError) as error:    # of somebody else
         return None, [], f"{reader.path.name} holds a trajectory that cannot be read ({error!r})"
 
 
-def samples_of(odometry: list[bytes], imu: list[bytes]) -> np.ndarray:
-    """Samples (SAMPLE) of messages on smoother/odometry and smoother/imu; what is not in them is
-    NaN.
+def samples_of(odometry: list[bytes], imu: list[bytes] | None) -> np.ndarray:
+    """Samples (SAMPLE) of messages on smoother/odometry and smoother/imu (None: there was no Imu);
+    what is not in them is NaN.
 
     Undoes what :mod:`imu_fusion.streams.smoother` does to write them.
     """
     stamp, _, values = ODOMETRY.decode_many(odometry)
-    imu_stamp, _, forces = IMU.decode_many(imu)
-    stamp, own, of_imu = np.intersect1d(stamp, imu_stamp, return_indices=True)
-    values, forces = values[own], forces[of_imu]
+    forces = np.full((len(stamp), IMU.size), np.nan)
+    if imu is not None:
+        imu_stamp, _, forces = IMU.decode_many(imu)
+        stamp, own, of_imu = np.intersect1d(stamp, imu_stamp, return_indices=True)
+        values, forces = values[own], forces[of_imu]
     rows = np.zeros(len(stamp), SAMPLE)
     for name in ("gyr_bias", "acc_bias", "gyr_bias_sd", "acc_bias_sd"):
         rows[name] = np.nan
@@ -77,7 +79,7 @@ def samples_of(odometry: list[bytes], imu: list[bytes]) -> np.ndarray:
     rotation = Rotation.from_quat(rows["quat_world_imu"]).as_matrix()
     back = rotation.transpose(0, 2, 1)
     vel_imu = values[:, ODOMETRY["linear"]]
-    turned = np.cross(np.eye(3), vel_imu[:, None, :])
+    turned = np.cross(np.eye(3), vel_imu[:, None, :]) * (imu is not None)
     rows["vel_world"] = np.einsum("nij,nj->ni", rotation, vel_imu)
     rows["cov_position"] = pose[:, :3, :3]
     rows["cov_attitude"] = back @ pose[:, 3:, 3:] @ rotation

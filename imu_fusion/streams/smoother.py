@@ -38,8 +38,20 @@ _REQUIRED = (IMU_TOPIC, FIX_TOPIC)
 
 
 def required_of(params: SmootherParams) -> tuple[str, ...]:
-    """Topics without which there is nothing to smooth: fixes are not, where the start is given."""
+    """Topics that a trajectory is made of: without fixes, where the start is given."""
     return _REQUIRED if params.initial.position is None else (IMU_TOPIC,)
+
+
+def lacking(params: SmootherParams, topics: Container[str | None]) -> list[str]:
+    """What keeps the smoother from smoothing these topics: fixes are enough."""
+    return [] if FIX_TOPIC in topics else [
+        topic for topic in required_of(params) if topic not in topics]
+
+
+def frame_of(logs: Mapping[str, Any]) -> str:
+    """frame_id of what moves: the Imu, or else the receiver."""
+    log = logs[IMU_TOPIC] if IMU_TOPIC in logs else logs[FIX_TOPIC]
+    return str(log.frame_id)
 
 
 class SmootherStream(Stream):
@@ -120,7 +132,7 @@ class SmootherStream(Stream):
         for parts in chosen.values():
             if len(parts) > 1:    # not again at the next call
                 parts[:] = [joined(parts)]
-        missing = [topic for topic in required_of(self.params) if not chosen[topic]]
+        missing = lacking(self.params, [topic for topic in INPUTS if chosen[topic]])
         if missing:
             raise EstimationError(
                 f"nothing to smooth: no samples on {' and '.join(missing)}"
@@ -130,16 +142,15 @@ class SmootherStream(Stream):
 
     def _length(self, stretch):
         """Whether a collection has what is needed, and its number of Imu samples."""
-        counts = [sum(len(stamp) for stamp, _ in stretch[topic])
-                  for topic in required_of(self.params)]
-        return min(counts) > 0, counts[0]
+        return (not lacking(self.params, [topic for topic in INPUTS if stretch[topic]]),
+                sum(len(stamp) for stamp, _ in stretch[IMU_TOPIC]))
 
     def conclude(self) -> Conclusion:
         """What the samples of a whole recording make: the smoothed trajectory; its detail is
         (SmootherResult, logs by topic)."""
         logs = self.logs()
         result = smooth(self.params, logs)
-        outcome = Outcome.of(result, logs[IMU_TOPIC].frame_id)
+        outcome = Outcome.of(result, frame_of(logs))
         return Conclusion(messages(result.samples, outcome, self.params),
                           outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
 
@@ -158,8 +169,8 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     surface = load_surface(params.surface.file) if params.surface.file else None
-    imu, mag = logs[IMU_TOPIC], logs.get(MAG_TOPIC)
-    if params.recover_rates:
+    imu, mag = logs.get(IMU_TOPIC), logs.get(MAG_TOPIC)
+    if imu is not None and params.recover_rates:
         imu = recover(imu, mag, recovery_params(params))
         params = params.replace(**{"sensor.gyro_range": None})
     return Smoother(params, surface).run(imu, mag, logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
@@ -184,4 +195,5 @@ def _configure(stage, params_file):
 
 
 STAGE = Stage("smoother", (SmoothingParams,), (EstimatorNodeParams, SmootherNodeParams), INPUTS,
-              _REQUIRED, OUTPUTS, SmootherStream, check_logs, _configure)
+              _REQUIRED, OUTPUTS, SmootherStream, check_logs, _configure,
+              dispensable=(IMU_TOPIC,))

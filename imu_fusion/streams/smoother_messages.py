@@ -44,6 +44,7 @@ UNITS = {
     **dict.fromkeys(("takeoff_stamp", "touchdown_stamp"), "ns"),
     **dict.fromkeys(("in_run_speed", "takeoff_speed", "landing_speed"), "m/s"),
     "takeoff_angle_deg": "deg", "flight_time": "s", "length": "m",
+    "acc_density": "m/s^2/sqrt(Hz)",
     **{block.name: _SI.get(block.unit, block.unit) for block in BLOCKS}}
 """Units of an Outcome's numbers and of the values of its states; those of ``<name>_sd``, and of
 ``sd`` beside a value, are the same. What is not named here is a count or a ratio."""
@@ -68,6 +69,7 @@ class Outcome:
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
             "adapted": result.adapted, "noise": result.noise,
+            "acc_density": result.acc_density,
             "states": {name: {"value": value.tolist(), "sd": sd.tolist()}
                        for name, (value, sd) in constant_states(result.states).items()},
             "outliers": {name: asdict(found) for name, found in result.outliers().items()}}
@@ -79,6 +81,11 @@ class Outcome:
             numbers["jump"] = result.jump.to_mapping()
         numbers["remarks"] = result.remarks()
         return cls(result.summary(), numbers, result.frame, frame_id)
+
+    @property
+    def attitude_known(self) -> bool:
+        """Whether there was an Imu."""
+        return self.numbers["acc_density"] is None
 
     @property
     def remarks(self) -> list[str]:
@@ -122,7 +129,8 @@ def messages(samples: np.ndarray, outcome: Outcome, params: SmoothingParams
     last.
 
     Odometry is in the world (east-north-up at the result's frame) with the twist in the
-    sensor's axes; its orientation covariance is about the fixed axes of the world.
+    sensor's axes; its orientation covariance is about the fixed axes of the world. Where there was
+    no Imu, the twist is in the axes of the world, and there is no smoother/imu.
 
     Args:
         samples: structured array of a SmootherResult. outcome: Outcome. params: SmoothingParams,
@@ -133,14 +141,16 @@ def messages(samples: np.ndarray, outcome: Outcome, params: SmoothingParams
     for first in range(0, len(samples), _SLICE):
         rows, of_path = samples[first:first + _SLICE], shown[first:first + _SLICE]
         stamp = np.ascontiguousarray(rows["stamp"])
-        odometry, imu, fix = _values(rows, outcome.frame)
+        odometry, imu, fix = _values(rows, outcome.frame, outcome.attitude_known)
         pose = odometry[of_path, :POSE_COVARIANCE.size]
         made = [Messages(ODOMETRY_TOPIC, stamp,
                          ODOMETRY.encode_block(stamp, world, odometry, body)),
-                Messages(SMOOTHED_IMU_TOPIC, stamp, IMU.encode_block(stamp, body, imu)),
                 Messages(SMOOTHED_FIX_TOPIC, stamp, fix_messages(stamp, body, fix)),
                 Messages(POSE_TOPIC, stamp[of_path],
                          POSE_COVARIANCE.encode_block(stamp[of_path], world, pose))]
+        if outcome.attitude_known:
+            made.insert(1, Messages(SMOOTHED_IMU_TOPIC, stamp,
+                                    IMU.encode_block(stamp, body, imu)))
         if params.publish_tf:
             made.append(Messages(TF_TOPIC, stamp, transform_messages(
                 stamp, world, body, rows["position_world"], rows["quat_world_imu"])))
@@ -158,7 +168,7 @@ def _shown(stamp, rate):
     return np.diff(slots, prepend=-1) > 0
 
 
-def _values(rows, frame):
+def _values(rows, frame, attitude_known):
     """Values of the messages of samples: Odometry and Imu in the order of their layouts, latitude,
     longitude, height and covariance; (n, size) each."""
     n = len(rows)
@@ -167,7 +177,7 @@ def _values(rows, frame):
     vel_imu = np.einsum("nij,nj->ni", back, rows["vel_world"])
     cov_attitude = rotation @ rows["cov_attitude"] @ back
     # A wrong attitude turns the velocity, too; how the two errors go together is not kept.
-    turned = np.cross(np.eye(3), vel_imu[:, None, :])
+    turned = np.cross(np.eye(3), vel_imu[:, None, :]) * attitude_known
     pose, twist, imu = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, IMU.size))
     pose[:, :3, :3], pose[:, 3:, 3:] = rows["cov_position"], cov_attitude
     twist[:, :3, :3] = (back @ rows["cov_velocity"] @ rotation

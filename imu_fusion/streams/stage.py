@@ -16,13 +16,15 @@ from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC
 
 def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
     """What looks wrong with whole logs as recorded, Imu, magnetometer and fixes by topic."""
-    found = checks.check_imu(logs[IMU_TOPIC], IMU_TOPIC)
+    imu, mag = logs.get(IMU_TOPIC), logs.get(MAG_TOPIC)
+    found = [] if imu is None else checks.check_imu(imu, IMU_TOPIC)
     if FIX_TOPIC in logs:
         found += checks.check_fix(logs[FIX_TOPIC])
-    if MAG_TOPIC in logs:
-        found += checks.check_mag(logs[MAG_TOPIC], MAG_TOPIC)
-        found += checks.check_clock(logs[MAG_TOPIC].stamp, logs[IMU_TOPIC].stamp, MAG_TOPIC)
-        found += check_axes(logs[IMU_TOPIC], logs[MAG_TOPIC], MAG_TOPIC)
+    if mag is not None:
+        found += checks.check_mag(mag, MAG_TOPIC)
+    if imu is not None and mag is not None:
+        found += checks.check_clock(mag.stamp, imu.stamp, MAG_TOPIC)
+        found += check_axes(imu, mag, MAG_TOPIC)
     return found
 
 
@@ -39,7 +41,7 @@ class Stage:
         params: classes of the parameters of the estimate; ``node_params``: of those that concern
             the node alone, which are read here and not used.
         inputs: topic to the SampleType that reads it; ``required`` are those without which it
-            cannot run.
+            cannot run. ``dispensable``: see :func:`~imu_fusion.recordings.inputs.find_inputs`.
         outputs: topic to message type.
         stream: the class of its Stream, ``(*params, warn=...)``.
         findings: ``(logs)`` lists what looks wrong with whole logs as recorded.
@@ -58,6 +60,7 @@ class Stage:
     findings: Callable[[Mapping], Sequence[Finding]] = _no_findings
     configure: Callable[["Stage", ParamsFile], tuple["Stage", list]] | None = None
     unusable: str = ""
+    dispensable: tuple[str, ...] = ()
 
     def prepare(self, params_file: ParamsFile = None) -> tuple["Stage", list]:
         """(Stage, parameters) under a ParamsFile.
@@ -79,11 +82,13 @@ class Stage:
         params = parameters_for(self.params + self.node_params, self.node, params_file)
         return params[:len(self.params)]
 
-    def input_types(self) -> tuple[dict[str, str], dict[str, str]]:
-        """Message types of the topics that are required, and of those that are not."""
+    def input_types(self) -> tuple[dict[str, str], dict[str, str], tuple[str, ...]]:
+        """Message types of the topics that are required, and of those that are not, and
+        ``dispensable``."""
         types = {topic: kind.layout.msgtype for topic, kind in self.inputs.items()}
         return ({topic: types[topic] for topic in self.required},
-                {topic: name for topic, name in types.items() if topic not in self.required})
+                {topic: name for topic, name in types.items() if topic not in self.required},
+                self.dispensable)
 
 
 @dataclass

@@ -10,6 +10,8 @@ from imu_fusion.cli import cli
 from imu_fusion.errors import BagError, EstimationError
 from imu_fusion.estimation.avalanche.radar import RadarLog, Secant, gates_of, range_differences
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.recordings.bag_reader import open_bag
+from imu_fusion.recordings.logs import read_log
 from imu_fusion.recordings.radar import read_radar
 from imu_fusion.report.radar import read_seen
 from test.sources.test_exports import at_hand, convert
@@ -83,6 +85,22 @@ def test_ranges_are_those_of_the_authors(tmp_path, node, rows, ground):
     assert np.abs(range_differences(seen.time, place, log)[rows]).max() < 0.02
     # Its velocities are the fixes'.
     assert seen.speed == pytest.approx(log.velocity, abs=2e-3)
+
+
+def test_a_smoothed_descent_is_where_its_fixes_are(tmp_path):
+    """Without an Imu: within what it says of itself, where the node lay still within two metres."""
+    source = at_hand("avanode/220222_C10_avalanche_GPS.txt")
+    assert convert(source, tmp_path / "bag")[0] == 0
+    result = CliRunner().invoke(cli, ["process", str(tmp_path / "bag"), str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    radar = LocalFrame(*RADAR)
+    raw, smoothed = (read_seen(tmp_path / name, radar) for name in ("bag", "out"))
+    assert len(raw.time) == len(smoothed.time)
+    with open_bag(tmp_path / "out") as bag:
+        sd = np.sqrt(read_log(bag, "smoother/fix").cov_enu.diagonal(0, 1, 2))
+    assert np.all(np.abs(raw.position - smoothed.position) < 3.0 * sd)
+    still = np.linalg.norm(raw.position - raw.position[-1], axis=1) < 5.0
+    assert np.abs(raw.range - smoothed.range)[still].max() < 2.0
 
 
 def test_the_command_writes_a_report_with_boxes(tmp_path):

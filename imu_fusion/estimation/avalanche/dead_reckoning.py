@@ -6,6 +6,8 @@ import numpy as np
 import scipy  # its parts are loaded where they are first used
 from numpy.typing import ArrayLike
 
+from imu_fusion.samples.free_fall import force_at
+
 
 @dataclass(frozen=True)
 class BallSamples:
@@ -46,13 +48,8 @@ def integrate(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 def central_force(samples: BallSamples) -> np.ndarray:
     """Specific force (n, 3) of the centre, in the ball's axes: the bracket of eq. (18), with
     central differences of the rates, eq. (19), one-sided at the ends."""
-    arm = np.asarray(samples.lever_arm, dtype=float)
-    rate, time = samples.rate, samples.time
-    n = len(time)
-    after, before = np.minimum(np.arange(n) + 1, n - 1), np.maximum(np.arange(n) - 1, 0)
-    change = (rate[after] - rate[before]) / (time[after] - time[before])[:, None]
-    return (samples.force - np.cross(change, arm)
-            - np.cross(rate, np.cross(rate, arm)))
+    return force_at(-np.asarray(samples.lever_arm, dtype=float), samples.time, samples.force,
+                    samples.rate)
 
 
 def dead_reckon(samples: BallSamples, gravity: float) -> Track:

@@ -8,13 +8,11 @@ words.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.samples.free_fall import FLIGHT_TIME, FREE_FALL, free_falls
 
 NAMES = ("rest", "entrainment", "ballistic flight", "impact", "steady flow", "rolling", "rest")
-
-_GAP = 3.0    # usual steps
 
 
 @dataclass(frozen=True)
@@ -22,10 +20,10 @@ class PhaseParams(Parameters):
     """``phases.*``: thresholds."""
 
     free_fall: float = param(
-        0.25, unit="g", low=0.01, high=0.9, doc="Largest specific force of the ball's centre in "
-        "flight. Raise it for an accelerometer with errors of many percent.")
+        FREE_FALL, unit="g", low=0.01, high=0.9, doc="Largest specific force of the ball's centre "
+        "in flight. Raise it for an accelerometer with errors of many percent.")
     flight_time: float = param(
-        0.12, unit="s", low=0.02, doc="Shortest flight that counts.")
+        FLIGHT_TIME, unit="s", low=0.02, doc="Shortest flight that counts.")
     first_flight_time: float = param(
         0.3, unit="s", low=0.02, doc="Shortest flight that is the throw of phase 2; without one "
         "the entrainment goes over into the steady flow.")
@@ -55,23 +53,13 @@ class Flight:
 
 def flights(time: np.ndarray, force: np.ndarray, gravity: float,
             params: PhaseParams = PhaseParams()) -> list[Flight]:
-    """Intervals in which only gravity acts; a gap in the samples ends one, since nobody knows.
+    """Flights (:func:`~imu_fusion.samples.free_fall.free_falls`).
 
     Args:
-        time: (n,) s. force: (n, 3) m/s^2, specific force of the ball's centre: at a rate of 35
-            rad/s a sensor 35 mm off it feels 4 g in flight. gravity: m/s^2.
+        time: (n,) s. force: (n, 3) m/s^2, specific force of the ball's centre. gravity: m/s^2.
     """
-    size = scipy.ndimage.median_filter(np.linalg.norm(force, axis=1), 3, mode="nearest")
-    free = np.concatenate([[False], size < params.free_fall * gravity, [False]])
-    edges = np.flatnonzero(np.diff(free.astype(int))).reshape(-1, 2)
-    steps = np.diff(time)
-    gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1
-    found = []
-    for a, b in edges:
-        inside = gaps[(gaps > a) & (gaps <= b)]
-        for begin, end in zip([a, *inside], [*(inside - 1), min(b, len(time) - 1)]):
-            found.append(Flight(float(time[begin]), float(time[end])))
-    return [f for f in found if f.end - f.start >= params.flight_time]
+    return [Flight(float(time[fall.start]), float(time[fall.end])) for fall in free_falls(
+        time, force, gravity, params.free_fall, params.flight_time)]
 
 
 def find_phases(time: np.ndarray, force: np.ndarray, rate: np.ndarray, stop: float,

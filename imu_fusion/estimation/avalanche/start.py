@@ -20,9 +20,12 @@ _SHORTEST = 0.5      # s, of a rest
 _QUIET_RATE = 0.15   # rad/s
 _QUIET_FORCE = 3.0   # m/s^2
 # The ball moves where the mean of a few samples deviates from the rest by more than this.
-_ONSET_SDS = 5.0
+_ONSET_SDS = 5.5
 _ONSET_FORCE = 0.15  # m/s^2, and at least by that
 _ONSET_RATE = 0.02   # rad/s
+_DYING_RATE = 0.5    # rad/s, from which on a spin is taken to die away
+_MEAN_OFF = 0.2      # s, by which a mean that tells the stop may be off
+_TIMES = np.geomspace(0.02, 2.0, 200)[:, None]   # s, in which it does
 _STANDARD_GRAVITY = 9.80665
 
 
@@ -72,13 +75,40 @@ def find_motion(imu: ImuLog) -> MotionSpan:
     away = _away(imu, level, slice(quiet_until, stop), 3)
     start = quiet_until + int(np.argmax(away)) if away.any() else stop
     if which + 1 < len(rests):
-        # What is quiet can still be coming to rest, ever more slowly: a longer mean tells when.
+        # What is quiet can still be coming to rest, ever more slowly: a longer mean tells when. And
+        # it has been at rest for as long as its window reaches back.
         begin, end = rests[which + 1]
-        slow = np.flatnonzero(_away(imu, slice((begin + end) // 2, end), slice(begin, end),
-                                    3 * width // 2))
-        stop = begin + int(slow[-1]) + 1 if len(slow) else begin
+        rest, begin = slice((begin + end) // 2, end), max(start, begin - width // 2 - 1)
+        away = _away(imu, rest, slice(begin, end), 3 * width // 2)
+        slow = np.flatnonzero(away[:rest.start - begin])
+        stop = _spin_ends(time, imu.gyr - imu.gyr[rest].mean(axis=0), begin,
+                          begin + int(slow[-1]) + 1 if len(slow) else begin, end)
     return MotionSpan(level.start, start, stop, imu.gyr[level].mean(axis=0),
                       imu.acc[level].mean(axis=0))
+
+
+def _spin_ends(time, rate, first, stop, end):
+    """Sample at which a spin is down to the least rate that counts.
+
+    There it is smaller than the noise of a sample. Drag takes a spin away in proportion to it, dry
+    friction evenly: the likelier of both, about any axis, is fitted where it is larger, too.
+    ``stop``, by a mean, stays where that is no explanation.
+
+    Args:
+        time: (n,) s. rate: (n, 3) rad/s, less that of the rest. first, end: samples within which
+            the rest begins.
+    """
+    fast = np.flatnonzero(np.linalg.norm(rate[:end], axis=1) > _DYING_RATE)
+    begin = min(int(fast[-1]) + 1, first) if len(fast) else first
+    since, seen = time[begin:end] - time[begin], rate[begin:end]
+    shapes = np.concatenate([np.exp(-since / _TIMES), np.maximum(1.0 - since / _TIMES, 0.0)])
+    weight = np.sum(shapes ** 2, axis=1)
+    size = np.linalg.norm(shapes @ seen, axis=1) / weight
+    best = int(np.argmax(size ** 2 * weight))     # of the squares, what a shape explains
+    larger = max(size[best] / _ONSET_RATE, 1.0)
+    left = np.log(larger) if best < len(_TIMES) else 1.0 - 1.0 / larger
+    ends = time[begin] + float(_TIMES[best % len(_TIMES), 0] * left)
+    return int(np.searchsorted(time, ends)) if abs(ends - time[stop]) < _MEAN_OFF else stop
 
 
 def _away(imu, level, part, width):
@@ -88,5 +118,6 @@ def _away(imu, level, part, width):
     for values, least in ((imu.gyr, _ONSET_RATE), (imu.acc, _ONSET_FORCE)):
         mean, sd = values[level].mean(axis=0), values[level].std(axis=0)
         smooth = scipy.ndimage.uniform_filter1d(values[part] - mean, width, axis=0)
-        away |= (np.abs(smooth) > np.maximum(_ONSET_SDS * sd / np.sqrt(width), least)).any(axis=1)
+        limit = max(_ONSET_SDS * float(sd.max()) / np.sqrt(width), least)
+        away |= np.linalg.norm(smooth, axis=1) > limit
     return away

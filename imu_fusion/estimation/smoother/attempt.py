@@ -21,6 +21,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.problem import Problem, log_density
+from imu_fusion.estimation.smoother.remarks import MOST_EXCESS
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.state import StatePrior
@@ -42,7 +43,7 @@ _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that
 
 
 class Given(NamedTuple):
-    """Arguments of :meth:`.smoother.Smoother.run`."""
+    """Arguments of :meth:`.smoother.Smoother.run`; ``felt``: whether an Imu felt the motion."""
 
     imu: ImuLog
     mag: MagLog | None
@@ -50,6 +51,7 @@ class Given(NamedTuple):
     velocity: VelocityLog | None
     events: JumpEvents | None
     initial_quat: np.ndarray | None
+    felt: bool = True
 
     def earlier(self, lag: float) -> "Given":
         """With stamps of the receiver that are earlier by a lag (s)."""
@@ -99,7 +101,7 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
     around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
     problem = Problem(prepared, params, readings, around, constraints,
-                      StatePrior.of(params, measured))
+                      StatePrior.of(params, measured), given.felt)
     hill = surface if isinstance(surface, Hill) and events is not None else None
     start = None if params.initial.position is None else frame.to_enu(*first)
     judge = "fix" if "fix" in measured else "mag"
@@ -186,9 +188,15 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],
                                              fit["innovation"][:, :width])
             residuals[measurement.name] = fit["residual"][:, :width]
-    wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()}
-    widen(samples, wander)
-    fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params)
+    # Innovations of velocities wander with accelerations that nobody felt.
+    wander = {name: wandering(*of_kind) for name, of_kind in innovations.items()
+              if problem.felt or name != "velocity"}
+    fits = surface_fits(problem.constraints, samples, states, solution.events, problem.params,
+                        problem.free[problem.imu.recorded])
+    # A jump's landing makes its length less certain; other surfaces make all.
+    off = {c.name: fits[c.name].excess for c in problem.constraints
+           if c.phase == "always" and c.name in fits and fits[c.name].excess > MOST_EXCESS}
+    widen(samples, wander | off)
     jump, near, failure = None, 0.0, ""
     if hill is not None and solution.events is not None:
         near = near_ground(samples, states, solution.events, problem.constraints, problem.params)

@@ -15,6 +15,7 @@ _FIRST = 200_000_000
 # First headings tried: quarter turns insure against a disturbed or mounted-over magnetometer;
 # without one, steps of 30 deg lead into the right minimum.
 _HEADINGS, _HEADINGS_BLIND = 4, 12
+_KNOWN_SD = np.pi / 8    # rad: a first attitude known to less is not tried a quarter turn off
 
 
 def attitude_from_vectors(acc: np.ndarray, mag: np.ndarray | None, field_world: np.ndarray
@@ -76,7 +77,7 @@ def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarr
         problem.mean[VEL:VEL + 3] = value[kind == VELOCITY][0]
     log = problem.imu.log
     beginning = int(np.searchsorted(log.stamp, log.stamp[0] + _FIRST))
-    candidates = _HEADINGS
+    candidates = _HEADINGS if problem.params.initial.attitude_sd > _KNOWN_SD else 1
     if initial_quat is None:
         reading = None
         if mag is not None and np.any(kind == MAG):

@@ -4,7 +4,8 @@ The readings are those of a solved problem, linear about its trajectory, so that
 likelihood is one pass of the filter forward.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from typing import Any
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
@@ -13,6 +14,7 @@ from imu_fusion.estimation.smoother.attempt import Model
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
 from imu_fusion.estimation.smoother.problem import NoiseFactors, Problem
 from imu_fusion.estimation.smoother.state import BLOCKS
+from imu_fusion.sensors.params import SENSOR
 
 _SENSOR = ("sensor.gyro_noise_density", "sensor.acc_noise_density", "sensor.gyro_bias_walk",
            "sensor.acc_bias_walk")
@@ -25,16 +27,17 @@ _SLOWEST = 0.25        # of a recording: errors that are slower are an offset th
 _SAMPLES = 60_000      # of the Imu, from the beginning on: ten minutes tell the noise
 
 
-def fit_noise(problem: Problem, model: Model) -> Model:
+def fit_noise(problem: Problem, model: Model, held: Collection[str] = ()) -> Model:
     """The model with the noise under which the readings are likeliest.
 
     Args:
-        problem: solved under ``model``.
+        problem: solved under ``model``. held: names of states that wander as they are given to.
     """
     present = np.unique(problem.readings["kind"])
     names = [MEASUREMENTS[kind].name for kind in present if MEASUREMENTS[kind].name != "mag"]
     wandering = [block.name for block in BLOCKS
-                 if block.tau is not None and getattr(problem.blocks, block.name) >= 0]
+                 if block.tau is not None and getattr(problem.blocks, block.name) >= 0
+                 and block.name not in held]
     first = len(_SENSOR) + len(names)
 
     def factors_of(logs: np.ndarray) -> NoiseFactors:
@@ -78,9 +81,15 @@ def _parameter(block: str) -> str:
     return block.replace("gnss_", "gnss.")
 
 
+def within_bounds(name: str, value: float) -> float:
+    """A value of a parameter ``sensor.*``, or the nearest that it can have."""
+    allowed = SENSOR[name.removeprefix("sensor.")]
+    return min(max(value, allowed["low"]), allowed["high"])
+
+
 def _with(model: Model, factors: NoiseFactors) -> Model:
     """The model with its noise multiplied by the factors."""
-    changes = {name: float(factor) * model.params.get(name)
+    changes: dict[str, Any] = {name: within_bounds(name, float(factor) * model.params.get(name))
                for name, factor in zip(_SENSOR, (*factors.noise, *factors.walk))}
     for name, (walk, tau) in factors.wander.items():
         parameter = _parameter(name)

@@ -20,6 +20,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 )
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
     evaluate_constraints,
+    in_free_fall,
     put_lever_derivatives,
     surface_points,
 )
@@ -105,17 +106,20 @@ class Problem:
         around: Surroundings.
         constraints: of the surface.
         prior: StatePrior, whose mean may be completed before the first step.
+        felt: whether an Imu felt the motion.
     """
 
     def __init__(self, imu: ImuInput, params: SmootherParams, readings: np.ndarray,
-                 around: Surroundings, constraints: Sequence[Constraint], prior: StatePrior):
-        self.imu, self.params, self.around = imu, params, around
+                 around: Surroundings, constraints: Sequence[Constraint], prior: StatePrior,
+                 felt: bool = True):
+        self.imu, self.params, self.around, self.felt = imu, params, around, felt
         self.constraints, self.prior = tuple(constraints), prior
         self.mean, self.prior_sd = prior.mean.copy(), prior.sd
         self.blocks, self.size = prior.blocks, len(prior.sd)
         self.delays = [i for i in (getattr(prior.blocks, name) for name in DELAYS) if i >= 0]
         self.model = model_of(prior, around, params.gnss.lever_arm)
         self.intervals = intervals_of(imu.steps, imu.means, imu.noise)
+        self.free = in_free_fall(imu.log, around.gravity, params.surface.lever_arm)
         self.contact_start = np.zeros(len(imu.log) + 1, np.int64)
         self.contacts = np.empty(0, CONTACT)
         self._start()
@@ -255,7 +259,8 @@ class Problem:
     def _touch(self, events: JumpEvents | None) -> None:
         """Evaluate the surface at the trajectory."""
         self.contact_start, self.contacts = evaluate_constraints(
-            self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params)
+            self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params,
+            self.free)
         lever = self._surface_lever()
         if self.blocks.surface_lever_arm >= 0 or np.any(lever):
             put_lever_derivatives(self.contact_start, self.contacts, self.x[:, ATT:ATT + 4], lever)

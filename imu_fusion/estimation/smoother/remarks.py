@@ -36,6 +36,7 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
     if result.converged is False:
         yield (f"the smoother did not converge in {result.iterations} iterations: take its "
                "result as provisional")
+    yield from _on_missing_imu(result)
     yield from _on_stamps(result)
     yield from _on_step(result)
     yield from _on_single_pass(result)
@@ -46,6 +47,14 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
     yield from _on_place(result)
     yield from _on_flight(result)
     yield from _on_surface(result)
+
+
+def _on_missing_imu(result):
+    if result.acc_density is not None:
+        yield ("no Imu samples: the trajectory is of fixes and velocities alone, and the attitude "
+               "is not known. Between them the velocity changes by white accelerations of "
+               f"{result.acc_density:.2g} m/s^2/sqrt(Hz)"
+               ", and the fixes wander by what is stated of them (gnss.position_error_sd)")
 
 
 def _on_stamps(result):
@@ -175,4 +184,5 @@ def _on_surface(result):
                    f"largest {fit.largest:.2f} m), over seconds {fit.excess:.1f} times as much as "
                    f"its sigma of {fit.sigma:g} m allows: the surface may be another than the one "
                    "given, or the sensor move against it (a larger sigma or surface.interval, "
-                   "surface.body_height_sd)")
+                   "surface.body_height_sd)"
+                   + ("" if result.jump else "; the standard deviations of all are as much larger"))

@@ -87,6 +87,8 @@ class SmootherResult:
     ``wander``: name -> how much larger than white noise leaves them its innovations are in the
     mean over seconds (:func:`.whiteness.wandering`), 1 where they are white; what is stated has
     been widened by it (:func:`.whiteness.widen`).
+    ``acc_density``: m/s^2/sqrt(Hz), of the accelerations of a body that carries no Imu, so that
+    attitudes are unknown; None: it does.
     ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
     or below it.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
@@ -108,6 +110,7 @@ class SmootherResult:
     adapted: dict[str, float] = field(default_factory=dict)
     noise: dict[str, float] = field(default_factory=dict)
     wander: dict[str, float] = field(default_factory=dict)
+    acc_density: float | None = None
     near_ground: float = 0.0
     failure: str = ""
     log_likelihood: float = -np.inf

@@ -11,6 +11,7 @@ from imu_fusion.estimation.smoother.gnss_lag import find_lag
 from imu_fusion.estimation.smoother.hypotheses import likelier
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.receiver_alone import smooth_receiver
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.surfaces.constraint import Surface
@@ -29,13 +30,14 @@ class Smoother:
     def __init__(self, params: SmootherParams = SmootherParams(), surface: Surface | None = None):
         self.params, self.surface = params, surface
 
-    def run(self, imu: ImuLog, mag: MagLog | None = None, fix: FixLog | None = None,
+    def run(self, imu: ImuLog | None, mag: MagLog | None = None, fix: FixLog | None = None,
             velocity: VelocityLog | None = None, events: JumpEvents | None = None,
             initial_quat: np.ndarray | None = None) -> SmootherResult:
         """Smooth one recording.
 
         Args:
-            imu: ImuLog. mag: MagLog or None. fix: FixLog. velocity: VelocityLog or None.
+            imu: ImuLog; None: fixes and velocities alone, see :mod:`.receiver_alone`.
+            mag: MagLog or None. fix: FixLog. velocity: VelocityLog or None.
             events: JumpEvents, or None: found by ``find_jump`` when the surface needs them.
             initial_quat: (4,) attitude of the first sample; found from the data when None.
 
@@ -47,6 +49,8 @@ class Smoother:
             EstimationError: no fix; events needed and not found; no convergence to finite
                 values.
         """
+        if imu is None:
+            return smooth_receiver(fix, velocity, self.params, self.surface)
         if self.params.method == "extended_rts":
             return ExtendedRts(self.params, self.surface).run(imu, mag, fix, velocity, events,
                                                               initial_quat)

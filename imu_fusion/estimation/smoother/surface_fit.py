@@ -44,12 +44,13 @@ class SurfaceFit:
 
 def surface_fits(constraints: Sequence[Constraint], samples: np.ndarray,
                  states: dict[str, tuple[np.ndarray, np.ndarray]], events: JumpEvents | None,
-                 params: SmootherParams) -> dict[str, SurfaceFit]:
+                 params: SmootherParams, free: np.ndarray | None = None
+                 ) -> dict[str, SurfaceFit]:
     """Name of the constraint -> :class:`SurfaceFit`, for those that hold anywhere.
 
     Args:
         constraints: of the surface. samples, states, events: of the SmootherResult.
-        params: SmootherParams.
+        params: SmootherParams. free: mask of the samples in free fall.
 
     Raises:
         EstimationError: none holds anywhere, though there are some.
@@ -58,13 +59,13 @@ def surface_fits(constraints: Sequence[Constraint], samples: np.ndarray,
     position_world = at_surface(samples, states, params)["position_world"]
     for constraint in constraints:
         start, contacts = evaluate_constraints(
-            [constraint], position_world, samples["stamp"], events, params)
+            [constraint], position_world, samples["stamp"], events, params, free)
         residual = contacts["residual"]
         if not len(residual):
             continue
         sample = np.repeat(np.arange(len(samples)), np.diff(start))
         active = holds(constraint, samples["stamp"], events, params.surface.windows,
-                       params.jump.event_margin)
+                       params.jump.event_margin, free)
         if constraint.height:
             height = states["body_height"][0][sample, 0] if "body_height" in states \
                 else params.surface.body_height

@@ -68,21 +68,23 @@ def correlation(innovations: np.ndarray) -> float:
 
 
 def widen(samples: np.ndarray, wander: dict[str, float]) -> None:
-    """Make the standard deviations of smoothed samples as much larger as innovations wander.
+    """Make the standard deviations of smoothed samples as much larger as innovations wander, or
+    deviations from a surface.
 
-    What a receiver says bears on all. The field bears on headings: gravity tells the tilt.
+    What a receiver or a surface says bears on all. The field bears on headings: gravity tells the
+    tilt.
 
     Args:
         samples: of a SmootherResult, in place. wander: name -> factor.
     """
-    receiver = max((f for name, f in wander.items() if name != "mag"), default=1.0)
+    every = max((f for name, f in wander.items() if name != "mag"), default=1.0)
     for name in ("cov_position", "cov_velocity", "cov_attitude"):
-        samples[name] *= receiver ** 2
+        samples[name] *= every ** 2
     for name in ("acc_bias_sd", "gyr_bias_sd"):
-        samples[name] *= receiver
+        samples[name] *= every
     field = wander.get("mag", 1.0)
-    if field > receiver:
+    if field > every:
         up = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"]).as_matrix()[:, 2]
         heading = np.einsum("ni,nij,nj->n", up, samples["cov_attitude"], up)
-        more = ((field / receiver) ** 2 - 1.0) * heading
+        more = ((field / every) ** 2 - 1.0) * heading
         samples["cov_attitude"] += more[:, None, None] * up[:, :, None] * up[:, None]

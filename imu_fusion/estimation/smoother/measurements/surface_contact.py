@@ -14,6 +14,8 @@ from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import CONTACT
 from imu_fusion.estimation.smoother.state import ATT, POS, slow
 from imu_fusion.kernels import njit
+from imu_fusion.samples.free_fall import force_at, free_falls
+from imu_fusion.samples.logs import ImuLog, seconds
 from imu_fusion.surfaces.constraint import Constraint
 
 
@@ -32,14 +34,25 @@ def surface_points(position_world: np.ndarray, quat_world_imu: np.ndarray,
     return position_world + attitude.apply(np.array(lever_imu))
 
 
+def in_free_fall(log: ImuLog, gravity: float, lever_imu: Sequence[float]) -> np.ndarray:
+    """Mask (N,) of the samples at which a point (3,) m of the body is in free fall."""
+    time = seconds(log.stamp, log.stamp[0])
+    free = np.zeros(len(log), bool)
+    for start, end in free_falls(time, force_at(lever_imu, time, log.acc, log.gyr), gravity):
+        free[start:end] = True
+    return free
+
+
 def holds(constraint: Constraint, stamp: np.ndarray, events: JumpEvents | None,
-          windows: Sequence[float], margin: float) -> np.ndarray:
-    """Mask (N,) of the samples at which a constraint holds: its phase of a jump, and the windows.
+          windows: Sequence[float], margin: float, free: np.ndarray | None = None) -> np.ndarray:
+    """Mask (N,) of the samples at which a constraint holds: its phase of a jump, or else where
+    something is felt, and the windows.
 
     Args:
         constraint, stamp, events: as of :func:`evaluate_constraints`.
         windows: s since the first stamp, start and stop in turn; empty: always.
         margin: s around the events in which heights are free.
+        free: as of :func:`evaluate_constraints`.
     """
     late = np.int64(round(margin * 1e9)) if constraint.height else np.int64(0)
     active = np.ones(len(stamp), bool)
@@ -48,6 +61,8 @@ def holds(constraint: Constraint, stamp: np.ndarray, events: JumpEvents | None,
             raise ValueError(f"constraint {constraint.name} holds in a part of a jump: give events")
         active = (stamp <= events.takeoff - late if constraint.phase == "in_run" else
                   stamp >= events.touchdown + late)
+    elif free is not None:
+        active = ~free
     if windows:
         # An odd number of bounds passed: inside of a window.
         bounds = np.round(np.array(windows) * 1e9).astype(np.int64)
@@ -56,8 +71,8 @@ def holds(constraint: Constraint, stamp: np.ndarray, events: JumpEvents | None,
 
 
 def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.ndarray,
-                         stamp: np.ndarray, events: JumpEvents | None, params: SmootherParams
-                         ) -> tuple[np.ndarray, np.ndarray]:
+                         stamp: np.ndarray, events: JumpEvents | None, params: SmootherParams,
+                         free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Rows of all constraints on the samples where they hold.
 
     A row of every sample says as much per second at any rate of the Imu: the standard deviation
@@ -69,6 +84,8 @@ def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.n
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
         params: ``jump.event_margin`` around the events heights are free.
+        free: mask (N,) of the samples :func:`in_free_fall`, at which nothing holds that holds
+            always; None: none.
 
     Returns:
         start (N + 1,) of the rows of each sample, rows (r,) of CONTACT, without derivatives but
@@ -81,7 +98,7 @@ def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.n
     samples, pieces = [np.empty(0, np.int64)], [np.empty(0, CONTACT)]
     for constraint in constraints:
         sample = np.flatnonzero(holds(constraint, stamp, events, params.surface.windows,
-                                      params.jump.event_margin))
+                                      params.jump.event_margin, free))
         if not len(sample):
             continue
         residual, gradient = constraint.evaluate(position_world[sample])
