@@ -101,4 +101,3 @@ def _parameters(reader: Reader, array: Description, path: Path) -> str:
     stamps = np.array([stamp for _, _, stamp, _ in reader.messages([topic])], dtype=np.int64)
     return (f"# Made from {reader.path.name} as {path.name} says.\n"
             + array_parameters(array, stamps, str(path)))
-

@@ -306,7 +306,7 @@ class OrientationEstimator:
                 "estimate took its gyroscope to turn: bias and attitude were wrong by more than "
                 "they were stated to be, and begin anew there; begin at rest, calibrate the "
                 "gyroscope (imu_fusion calibrate gyroscope) or raise sensor.gyro_bias_sd")
-        if wander.is_lost(self._state[best]["wander"]["overall"]):
+        if self._state[best]["wander"]["overall"][wander.TILT] > wander.LOST:
             found.append(
                 "field, forces and rates contradict each other by far more than their stated "
                 "errors allow: the heading may be any; begin at rest, or calibrate the "

@@ -16,7 +16,7 @@ from imu_fusion.kernels import njit
 _TIME = 5.0            # s, of the low-pass: slower than the motion, faster than the tilt forgets
 _MEMORY = 10.0         # s, over which its square is judged
 _PRIOR = 2.0           # s, that white innovations count for before there are any
-_LOST = 9.0            # mean square of the tilt's above which nothing that is linear describes it
+LOST = 9.0             # mean square of the tilt's above which nothing that is linear describes it
 TILT, HEADING = 0, 1   # of the mean squares
 # Powers of the mean square by which standard deviations grow: 0.5 where innovations keep all of an
 # error. Tilt is followed fast, heading slowly. Chosen on the phones of benchmarks/orientation_sets.
@@ -72,12 +72,5 @@ def widen(cov_world, squares, overall):
     for i in range(3):
         for j in range(3):
             cov_world[i, j] *= factor[i] * factor[j]
-    if is_lost(overall):
+    if overall[TILT] > LOST:
         cov_world[2, 2] += UNIFORM_VARIANCE
-
-
-@njit
-def is_lost(overall):
-    """Whether innovations have wandered by more than any error that the filter follows makes
-    them, by their mean squares (2,) so far."""
-    return overall[TILT] > _LOST
