@@ -25,7 +25,7 @@ from benchmarks.recording_of_all import write_parameters, write_recording
 from benchmarks.table import RESULTS
 from imu_fusion.estimation.orientation.estimator import OrientationParams
 from imu_fusion.messages.convert import imu_message, mag_message
-from imu_fusion.messages.layouts import ACCEL, IMU, VECTOR3
+from imu_fusion.messages.layouts import ACCEL, FIX, IMU, VECTOR3
 from imu_fusion.messages.point_cloud import POINT_CLOUD_TYPE
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.recordings.bag_reader import open_bag
@@ -45,14 +45,14 @@ BOUND = ("first", "middle", "last")
 ALL = ("orientation_estimator", "acceleration_field_estimator", "smoother")
 MAG = "sensor_msgs/msg/MagneticField"
 # What these take and publish with each sample of the topic that they answer, which stands last.
-BARE = {"orientation_estimator": ({"imu/mag": MAG, "imu/data_raw": IMU.msgtype},
+BARE = {"orientation_estimator": ({"fix": FIX.msgtype, "imu/mag": MAG, "imu/data_raw": IMU.msgtype},
                                   {"imu/data": IMU.msgtype, "imu/rpy/filtered": VECTOR3.msgtype}),
         "acceleration_field_estimator": (
             {"imu/data_raw": IMU.msgtype} | {f"accelerometers/{name}": IMU.msgtype
                                              for name in ("top", "left", "front", "back")},
             {"acceleration_field/imu": IMU.msgtype, "acceleration_field/accel": ACCEL.msgtype,
              "acceleration_field/points": POINT_CLOUD_TYPE}),
-        "smoother": ({"imu/mag": MAG, "imu/data_raw": IMU.msgtype}, {})}
+        "smoother": ({"imu/mag": MAG, "fix": FIX.msgtype, "imu/data_raw": IMU.msgtype}, {})}
 DRIVER = """
 import sys, time
 import rclpy
