@@ -20,7 +20,7 @@ from imu_fusion.estimation.orientation.fixed_interval import smooth
 from imu_fusion.estimation.orientation.fixed_lag import FixedLag
 from imu_fusion.estimation.orientation.gyro_limit import limits_of
 from imu_fusion.estimation.orientation.imu_rejection import are_imu_samples, is_imu_sample
-from imu_fusion.estimation.orientation.lost_turn import widen_after_gaps
+from imu_fusion.estimation.orientation.lost_turn import is_blind, widen_lost
 from imu_fusion.estimation.orientation.mag_rejection import is_mag_sample
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_GAP, ORIENTATION_DTYPE
@@ -306,6 +306,11 @@ class OrientationEstimator:
                 "estimate took its gyroscope to turn: bias and attitude were wrong by more than "
                 "they were stated to be, and begin anew there; begin at rest, calibrate the "
                 "gyroscope (imu_fusion calibrate gyroscope) or raise sensor.gyro_bias_sd")
+        if self._alignment is not None and is_blind(self.params, self._alignment.at_rest):
+            found.append(
+                "the samples begin in motion, or go on in motion after a gap in which all starts "
+                "anew (gap.restart), and forces are not used (fusion.use_acc): nothing shows the "
+                "vertical, the orientation there may be any; begin at rest")
         if self._state[best]["wander"]["overall"][wander.TILT] > wander.LOST:
             found.append(
                 "field, forces and rates contradict each other by far more than their stated "
@@ -371,13 +376,14 @@ class OrientationEstimator:
         first = good & (imu.stamp <= end)
         first_mag = mag_stamps <= end
         first_mag[first_mag] = [is_mag_sample(mag) for mag in mags[first_mag]]
-        self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
+        at_rest = self._align(imu.stamp[first], samples[first], mag_stamps[first_mag],
+                              mags[first_mag])
         self._know_limits(limits_of(samples[good, :3], self._par))
         rows = np.zeros(len(imu), ORIENTATION_DTYPE)
         after = mag_stamps >= origin
         written = smooth(self._state, self._par, imu.stamp, samples, mag_stamps[after],
                          mags[after], rows)
-        widen_after_gaps(rows[:written], self.params)
+        widen_lost(rows[:written], self.params, at_rest)
         return rows[:written]
 
     def _know_limits(self, found):
@@ -414,6 +420,7 @@ class OrientationEstimator:
             self._state["mag_lag"] = sensor.mag_delay - par["gyro_delay"]
         kernel.initialise(self._state, par, self._alignment)
         self._state["align_until"] = stamps[-1]
+        return self._alignment.at_rest
 
     def _run_kernel(self, stamps, samples, mag_stamps, mags):
         if self._lag is None:

@@ -10,7 +10,7 @@ from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.gnss_step import GnssStep
 from imu_fusion.estimation.smoother.imu_input import first_place, prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.initial import first_attitudes
-from imu_fusion.estimation.smoother.iterated import Solution, solve
+from imu_fusion.estimation.smoother.iterated import SOFTNESS, Solution, solve
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
 from imu_fusion.estimation.smoother.measurements.registry import (
@@ -163,9 +163,16 @@ def _from_attitude(problem, frame, hill, quat, events):
         return events if hill is None else refine_jump(hill, _positions(problem), problem.imu.log,
                                                        events)
 
-    own = problem.from_attitude(quat)
-    solution = solve(own, events if hill is not None else None, refine)
-    return Attempt(own, _result(own, frame, hill, solution)) if np.isfinite(own.x).all() else None
+    solved = []
+    for softness in SOFTNESS if problem.on_rough_surface else SOFTNESS[:1]:
+        own = problem.from_attitude(quat)
+        solution = solve(own, events if hill is not None else None, refine, softness)
+        if np.isfinite(own.x).all():
+            solved.append((own, solution))
+    if not solved:
+        return None
+    own, solution = min(solved, key=lambda one: one[0].cost[-1])
+    return Attempt(own, _result(own, frame, hill, solution))
 
 
 def _positions(problem: Problem) -> np.ndarray:
@@ -211,5 +218,6 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
                           residuals=residuals, wander=wander, near_ground=near, failure=failure,
+                          lost_turns=tuple(problem.lost_turns),
                           log_likelihood=log_density(problem.readings)
                           - solution.last.surprise)

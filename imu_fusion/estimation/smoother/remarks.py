@@ -37,6 +37,7 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
         yield (f"the smoother did not converge in {result.iterations} iterations: take its "
                "result as provisional")
     yield from _on_missing_imu(result)
+    yield from _on_lost_turns(result)
     yield from _on_stamps(result)
     yield from _on_step(result)
     yield from _on_single_pass(result)
@@ -55,6 +56,17 @@ def _on_missing_imu(result):
                "is not known. Between them the velocity changes by white accelerations of "
                f"{result.acc_density:.2g} m/s^2/sqrt(Hz)"
                ", and the fixes wander by what is stated of them (gnss.position_error_sd)")
+
+
+def _on_lost_turns(result):
+    if result.lost_turns:
+        when = ", ".join(f"{(stamp - int(result.samples['stamp'][0])) * 1e-9:.1f}"
+                         for stamp in result.lost_turns)
+        yield (f"the turn about the magnetic field was lost (a gap in the Imu samples, or rates "
+               f"beyond the range) {when} s after the first Imu sample: of several that fit what "
+               "follows about as well the likeliest is taken, and attitude and trajectory from "
+               "there on may be wrong by more than is stated; more fixes, or a surface known "
+               "better, tell")
 
 
 def _on_stamps(result):

@@ -91,6 +91,8 @@ class SmootherResult:
     attitudes are unknown; None: it does.
     ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
     or below it.
+    ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
+    likely: the turn about the field had been lost.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
@@ -112,6 +114,7 @@ class SmootherResult:
     wander: dict[str, float] = field(default_factory=dict)
     acc_density: float | None = None
     near_ground: float = 0.0
+    lost_turns: tuple[int, ...] = ()
     failure: str = ""
     log_likelihood: float = -np.inf
 
