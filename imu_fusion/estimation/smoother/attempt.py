@@ -53,22 +53,26 @@ class Given(NamedTuple):
     initial_quat: np.ndarray | None
     felt: bool = True
 
-    def earlier(self, lag: float) -> "Given":
-        """With stamps of the receiver that are earlier by a lag (s)."""
-        late, fix, velocity = np.int64(round(lag * 1e9)), self.fix, self.velocity
+    def earlier(self, of_fixes: float, of_velocities: float) -> "Given":
+        """With stamps of fixes and of velocities that are earlier by their lags (s)."""
+        fix, velocity = self.fix, self.velocity
         return self._replace(
-            fix=None if fix is None else replace(fix, stamp=fix.stamp - late),
-            velocity=None if velocity is None else replace(velocity, stamp=velocity.stamp - late))
+            fix=None if fix is None else replace(
+                fix, stamp=fix.stamp - np.int64(round(of_fixes * 1e9))),
+            velocity=None if velocity is None else replace(
+                velocity, stamp=velocity.stamp - np.int64(round(of_velocities * 1e9))))
 
 
 class Model(NamedTuple):
     """What is taken to be true of a recording: ``params``; ``step_at``, stamp (ns) of the first
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
-    standard deviations."""
+    standard deviations; ``repeats``: whether readings of the receiver that are the one before
+    exactly are measurements."""
 
     params: SmootherParams
     step_at: int | None = None
     noise: Mapping[str, float] = {}
+    repeats: bool = True
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -121,6 +125,10 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
         best = _likeliest(best, hill, frame)
     if best.result.failure:
         raise EstimationError(best.result.failure)
+    if not model.repeats:
+        best = best._replace(result=replace(best.result, repeats={
+            name: int((~is_news(log)).sum()) for name, log in (
+                ("fix", given.fix), ("velocity", given.velocity)) if log is not None}))
     if model.step_at is not None:
         offset, sd = (values[0] for values in best.result.states["gnss_step"])
         return best._replace(result=replace(best.result,
@@ -130,15 +138,31 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
 
 def _readings(given, model, frame):
     """Readings of records.READING, under the model."""
-    logs: dict[str, Log | None] = {"velocity": given.velocity, "mag": given.mag}
-    if given.fix is not None and given.fix.usable.any():
-        fix = given.fix[given.fix.usable]
+    fix, velocity = given.fix, given.velocity
+    if not model.repeats:
+        fix = None if fix is None else fix[is_news(fix)]
+        velocity = None if velocity is None else velocity[is_news(velocity)]
+    logs: dict[str, Log | None] = {"velocity": velocity, "mag": given.mag}
+    if fix is not None and fix.usable.any():
+        fix = fix[fix.usable]
         moved = fix.stamp >= (np.inf if model.step_at is None else model.step_at)
         logs |= {"fix": fix[~moved], "moved_fix": fix[moved]} if moved.any() else {"fix": fix}
     readings = prepare_readings(logs, frame, model.params)
     for name, factor in model.noise.items():
         readings["whiten"][readings["kind"] == KINDS[name]] /= factor
     return readings
+
+
+def is_news(log: FixLog | VelocityLog) -> np.ndarray:
+    """Mask (n,) of readings that are not the one before exactly; a velocity of zero may be."""
+    if isinstance(log, FixLog):
+        values = np.column_stack([log.latitude_deg, log.longitude_deg, log.height])
+    else:
+        values = log.vel_world
+    same = np.all(values[1:] == values[:-1], axis=1)
+    if isinstance(log, VelocityLog):
+        same &= values[1:].any(axis=1)
+    return np.append(True, ~same)[:len(log)]
 
 
 def _likeliest(first, hill, frame):
