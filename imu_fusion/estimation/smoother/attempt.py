@@ -39,6 +39,7 @@ from imu_fusion.surfaces.hill import Hill
 
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
+_MOVES = 3.0         # standard deviations of a speed that is no rest
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
@@ -126,9 +127,7 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     if best.result.failure:
         raise EstimationError(best.result.failure)
     if not model.repeats:
-        best = best._replace(result=replace(best.result, repeats={
-            name: int((~is_news(log)).sum()) for name, log in (
-                ("fix", given.fix), ("velocity", given.velocity)) if log is not None}))
+        best = best._replace(result=replace(best.result, repeats=_repeats(given, best.result)))
     if model.step_at is not None:
         offset, sd = (values[0] for values in best.result.states["gnss_step"])
         return best._replace(result=replace(best.result,
@@ -151,6 +150,21 @@ def _readings(given, model, frame):
     for name, factor in model.noise.items():
         readings["whiten"][readings["kind"] == KINDS[name]] /= factor
     return readings
+
+
+def _repeats(given, result):
+    """Name -> number of readings that are the one before exactly, while the body moves."""
+    found = {}
+    for name, log in (("fix", given.fix), ("velocity", given.velocity)):
+        if log is None:
+            continue
+        at = np.searchsorted(result.samples["stamp"], log.stamp[~is_news(log)])
+        samples = result.samples[at[at < len(result.samples)]]
+        speed = np.sum(samples["vel_world"] ** 2, axis=1) / np.trace(
+            samples["cov_velocity"], axis1=1, axis2=2)
+        if len(speed) and np.median(speed) > _MOVES ** 2:
+            found[name] = len(speed)
+    return found
 
 
 def is_news(log: FixLog | VelocityLog) -> np.ndarray:

@@ -115,8 +115,9 @@ def _deep_landing(found, model, smooth):
 
 
 def _repeated(found, model, smooth):
-    """Without readings that are the one before exactly, of a receiver that holds its last, if the
-    others fit then, or far better; not compared by likelihood, as these rows are left out."""
+    """Without readings that are the one before exactly, of a receiver that holds its last while the
+    body moves, if the others fit then, or far better; not compared by likelihood, as these rows are
+    left out."""
     if fits(found.result) and not _many_outliers(found.result):
         return found, model
     other = model._replace(repeats=False)
@@ -124,7 +125,7 @@ def _repeated(found, model, smooth):
         tried = smooth(other)
     except EstimationError:
         return found, model
-    if not any(tried.result.repeats.values()) or _many_outliers(tried.result):
+    if not tried.result.repeats or _many_outliers(tried.result):
         return found, model
     better = fits(tried.result) or _left(tried.result) <= max(1.0, _LEFT * _left(found.result))
     return (tried, other) if better else (found, model)
