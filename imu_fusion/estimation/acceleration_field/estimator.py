@@ -294,5 +294,6 @@ class AccelerationFieldEstimator:
         return rest_start(params, self.array, self._rest)
 
     def _make_filter(self, start):
-        kind = RigidBodyFilter if self.params.method == "rigid_body" else AffineFilter
-        return kind(self.params, self.array, start)
+        if self.params.method == "rigid_body":
+            return RigidBodyFilter(self.params, self.array, start, asks=True)
+        return AffineFilter(self.params, self.array, start)

@@ -93,6 +93,11 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
         cov[THETA:OMEGA, THETA:OMEGA] = np.eye(3) - np.outer(up, up)
         constraint[:, THETA:OMEGA] = -skew(target)
     x, cov = _update(x, cov, constraint, target, np.eye(3) * _STILL_SD ** 2)
+    return folded(x, cov, quat)
+
+
+def folded(x: np.ndarray, cov: np.ndarray, quat: np.ndarray) -> Start:
+    """A Start whose theta is in its quaternion."""
     turn = scipy.spatial.transform.Rotation.from_rotvec(parts(x).theta)
     quat = (scipy.spatial.transform.Rotation.from_quat(quat) * turn).as_quat()
     parts(x).theta[:] = 0.0
