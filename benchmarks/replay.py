@@ -247,7 +247,7 @@ def live_once(checkout, bag, nodes_there, folder):
     for output, source in (("/imu/data", "/imu/data_raw"),
                            ("/acceleration_field/imu", "/accelerometers/back")):
         made, came = times.get(output, {}), times.get(source, {})
-        if made and checkout is not None:
+        if made:
             begin = min(made) + STARTED
             delays[output] = [(made[s] - came[s]) * 1e-6 for s in made if s in came and s > begin]
     return share, delays
