@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.scenarios import Outcome, Scenario
-from imu_fusion.errors import LayoutError
+from benchmarks.scenarios import LIMIT, Outcome, Scenario
+from imu_fusion.errors import EstimationError, LayoutError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
@@ -97,7 +97,7 @@ def field_row(situation, before, readings, changes=None, **params) -> Scenario:
     return Scenario("Acceleration field", situation, before, run)
 
 
-def gyro_row(situation, before, bias=0.0, delay=0.0, scale_sd=0.0) -> Scenario:
+def gyro_row(situation, before, bias=0.0, delay=0.0, scale_sd=0.0, scale=1.0) -> Scenario:
     """Scenario with a gyroscope, 1 mm and 2 deg off."""
     params = FIELD.replace(**{"use_gyro": True, "sensor.gyro_noise_density": 0.02 / 1000 ** 0.5})
 
@@ -106,7 +106,7 @@ def gyro_row(situation, before, bias=0.0, delay=0.0, scale_sd=0.0) -> Scenario:
         readings = felt(rng, 1e-3, 0.035)
         gyr = np.column_stack([np.interp(MOTION.t - delay, MOTION.t, rate)
                                for rate in MOTION.omega.T])
-        gyr = (gyr * (1.0 + scale_sd * rng.standard_normal(3)) + bias * np.sign(rng.normal(size=3))
+        gyr = (scale * gyr * (1.0 + scale_sd * rng.standard_normal(3)) + bias * np.sign(rng.normal(size=3))
                + rng.normal(0.0, 0.02, gyr.shape))
         return field_outcome(readings, layout(), params, gyr=gyr)
     return Scenario("Acceleration field", situation, before, run)
@@ -185,6 +185,60 @@ def a_fifth_lost(rng):
     readings = felt(rng, 1e-3, 0.035)
     readings[rng.random(len(readings)) < 0.2, 1] = np.nan
     return readings
+
+
+def biased(rng):
+    readings = felt(rng, 1e-3, 0.035)
+    readings[:, 1, 0] += 2.0
+    return readings
+
+
+def filtered(rng):
+    """A first-order low-pass of 5 ms."""
+    readings = felt(rng, 1e-3, 0.035)
+    share = 1.0 - np.exp(-1e-3 / 5e-3)
+    for n in range(1, len(readings)):
+        readings[n, 1] = readings[n - 1, 1] + share * (readings[n, 1] - readings[n - 1, 1])
+    return readings
+
+
+def seldom(rng):
+    readings = felt(rng, 1e-3, 0.035)
+    readings[np.arange(len(readings)) % 10 != 0, 1] = np.nan
+    return readings
+
+
+def spinning_row(speed, axis, use_gyro, before) -> Scenario:
+    """Scenario of a body that turns steadily from the first sample on, and is said to be still."""
+    t = np.arange(3000) * 1e-3
+    stamp = np.round(t * 1e9).astype(np.int64)
+    axis = np.array(axis) / np.linalg.norm(axis)
+    omega = np.tile(speed * axis, (len(t), 1))
+    up = Rotation.from_rotvec(-np.outer(speed * t, axis)).apply([0.0, 0.0, 9.8])
+    spun = np.cross(omega[0], np.cross(omega[0], PLACES))
+    params = AccelerationFieldParams(gravity=9.8, use_gyro=use_gyro)
+    if use_gyro:
+        params = params.replace(**{"sensor.gyro_noise_density": 0.02 / 1000 ** 0.5})
+
+    def run(seed):
+        rng = np.random.default_rng(seed)
+        readings = np.einsum("kij,nkj->nki", PAPER_AXES, up[:, None] + spun)
+        readings += rng.normal(0.0, BIAS, (1, 4, 3)) + rng.normal(0.0, NOISE, readings.shape)
+        gyr = omega + rng.normal(0.0, 0.02, omega.shape) if use_gyro else None
+        estimator = AccelerationFieldEstimator(params, layout())
+        try:
+            rows = estimator.run(stamp, readings, gyr)
+        except EstimationError as error:
+            return Outcome(said=[str(error)], refused=True)
+        error = speed * axis - rows["omega"]
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_omega"]), error)
+        sd = np.sqrt(np.mean(np.trace(rows["cov_omega"], axis1=1, axis2=2)))
+        return Outcome(np.sqrt(np.mean(np.sum(error ** 2, axis=1))), sd, "rad/s", nees.mean(),
+                       np.mean(nees < LIMIT), estimator.remarks())
+    about = "the vertical" if axis[2] == 1.0 else "a horizontal axis"
+    return Scenario("Acceleration field", f"spins at {speed} rad/s about {about} from the first "
+                    "sample on, said to be still" + (", with a gyroscope" if use_gyro else ""),
+                    before, run)
 
 
 def scales_off(rng):
@@ -279,7 +333,15 @@ FIELD_ROWS = [
     field_row("scale of each axis off by 1 %, 1 mm and 2 deg off", "NEES 124", scales_off),
     field_row("scale of each axis off by 1 %, 1 mm and 2 deg off, smoothed", "", scales_off,
               mode="smoothed"),
+    field_row("one of four with a bias of 2 m/s^2 (bias_sd 0.1), 1 mm and 2 deg off", "silent",
+              biased),
+    field_row("one of four behind a low-pass of 5 ms, 1 mm and 2 deg off", "", filtered),
+    field_row("one of four at a tenth of the rate, 1 mm and 2 deg off", "", seldom),
+    *(spinning_row(speed, axis, use_gyro, "silent") for speed, axis, use_gyro in (
+        (0.6, (1.0, 0.0, 0.0), False), (1.7, (0.0, 0.0, 1.0), True), (5.0, (0.0, 0.0, 1.0), False),
+        (1.7, (0.0, 0.0, 1.0), False))),
     gyro_row("with a gyroscope", ""),
+    gyro_row("with a gyroscope whose scales are off by 10 %", "silent", scale=1.1),
     gyro_row("with a gyroscope whose scales are off by 1 %", "", scale_sd=0.01),
     gyro_row("with a gyroscope whose bias is 0.3 rad/s (gyro_bias_sd 0.02)", "silent", bias=0.3),
     gyro_row("with a gyroscope that is 10 ms late", "silent in 1 of 3", delay=0.01),

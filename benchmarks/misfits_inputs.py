@@ -17,11 +17,12 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 AK8963 = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-def input_row(situation, before, spoil, with_mag=True) -> Scenario:
+def input_row(situation, before, spoil, with_mag=True, travel_sd=0.2) -> Scenario:
     """Scenario of logs that spoil(imu, mag, rng) -> (imu, mag) has spoilt."""
     def run(seed):
-        imu, mag, truth, _ = simulate(Tumbling(seed=seed, quat_start=LEVEL), 25.0, rate=100.0, sensors=REAL,
-                                      seed=seed)
+        imu, mag, truth, _ = simulate(
+            Tumbling(seed=seed, quat_start=LEVEL, travel_sd=travel_sd), 25.0, rate=100.0,
+            sensors=REAL, seed=seed)
         imu, mag = spoil(imu, mag if with_mag else mag[:0], np.random.default_rng(seed))
         logs = {IMU_TOPIC: imu} | ({MAG_TOPIC: mag} if with_mag else {})
         found = findings(logs)
@@ -55,6 +56,24 @@ def with_imu(imu, gyr=None, acc=None):
                   imu.frame_id)
 
 
+def late(imu, mag, rng):
+    t = (imu.stamp - imu.stamp[0]) * 1e-9
+    return with_imu(imu, np.column_stack([np.interp(t - 0.1, t, rate) for rate in imu.gyr.T])), mag
+
+
+def of_another_body(imu, mag, rng):
+    other = Tumbling(seed=int(rng.integers(1000, 9999)), quat_start=LEVEL)
+    return with_imu(imu, simulate(other, 25.0, rate=100.0, sensors=REAL)[0].gyr), mag
+
+
+def sticks(axes):
+    def spoil(imu, mag, rng):
+        gyr = imu.gyr.copy()
+        gyr[len(gyr) // 2:, axes] = gyr[len(gyr) // 2, axes]
+        return with_imu(imu, gyr), mag
+    return spoil
+
+
 def half_filled(imu, mag, rng):
     first = (np.arange(len(imu)) % 2 == 0)[:, None]
     return with_imu(imu, imu.gyr * first, imu.acc * ~first), mag
@@ -80,6 +99,17 @@ INPUT_ROWS = [
               lambda imu, mag, rng: (with_imu(imu, imu.gyr @ QUARTER.T), mag), with_mag=False),
     input_row("rate exactly zero", "silent",
               lambda imu, mag, rng: (with_imu(imu, 0.0 * imu.gyr), mag)),
+    input_row("rates half as large", "silent",
+              lambda imu, mag, rng: (with_imu(imu, 0.5 * imu.gyr), mag)),
+    input_row("rates in rpm", "silent",
+              lambda imu, mag, rng: (with_imu(imu, imu.gyr * 30.0 / np.pi), mag)),
+    input_row("gyroscope 0.1 s late", "silent", late),
+    input_row("gyroscope 0.1 s late, turning in place", "silent", late, travel_sd=0.01),
+    input_row("gyroscope of another body", "silent", of_another_body),
+    input_row("gyroscope sticks half way", "silent", sticks([0, 1, 2])),
+    input_row("z of the gyroscope sticks half way", "silent", sticks([2])),
+    input_row("z of the gyroscope is zero", "silent",
+              lambda imu, mag, rng: (with_imu(imu, imu.gyr * [1.0, 1.0, 0.0]), mag)),
     input_row("alternate half-filled messages", "silent", half_filled),
     input_row("magnetometer a quarter turn off", "87 deg, stated 5",
               lambda imu, mag, rng: (imu, MagLog(mag.stamp, mag.mag @ QUARTER.T))),
