@@ -15,8 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 
 from benchmarks import hostile_peers
 from benchmarks.flow import DRIVER
+from benchmarks.replay import beside
 from benchmarks.table import table
 from imu_fusion.errors import BagError
 from imu_fusion.messages.convert import fix_message, imu_message, mag_message
@@ -150,18 +150,6 @@ class Trial:
                                     if node in ("replayer", "recorder")):
             self.amiss.append(f"{sent - found} missing, and nobody says so")
 
-    @contextmanager
-    def beside(self, *command: str) -> Iterator[subprocess.Popen]:
-        """Another process in this domain."""
-        process = subprocess.Popen([sys.executable, *command], env=os.environ | {
-            "ROS_DOMAIN_ID": str(self.nodes.domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
-        try:
-            yield process
-        finally:
-            process.kill()
-            process.wait()
-
 
 def size_of(recording: Path) -> int:
     """Bytes of its file so far."""
@@ -278,9 +266,9 @@ def hostile(kind: str, trial: Trial) -> None:
     trial.nodes.start("orientation_estimator")
     trial.nodes.start("smoother")
     trial.until(trial.out.exists)
-    with trial.beside("-m", "benchmarks.hostile_peers", kind) as peer:
+    with beside(trial.nodes, "-m", "benchmarks.hostile_peers", kind) as peer:
         peer.wait(PATIENCE)
-    with trial.beside("-c", DRIVER):
+    with beside(trial.nodes, "-c", DRIVER):
         grown = size_of(trial.out) + 20_000
         trial.until(lambda: size_of(trial.out) > grown, "no sensor is heard any more")
     trial.end("orientation_estimator", "smoother", "recorder", number=signal.SIGINT)
@@ -294,7 +282,7 @@ def hostile(kind: str, trial: Trial) -> None:
 def hostile_session(kind: str, trial: Trial) -> None:
     """The same beside a replay."""
     trial.play(rate=0.4)
-    with trial.beside("-m", "benchmarks.hostile_peers", kind):
+    with beside(trial.nodes, "-m", "benchmarks.hostile_peers", kind):
         trial.end("replayer", "recorder")
     trial.end("orientation_estimator", number=signal.SIGINT)
     trial.compare()

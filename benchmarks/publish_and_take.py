@@ -3,7 +3,8 @@
     python -m benchmarks.publish_and_take ROLE COUNT
 
 ``first`` publishes ``COUNT`` messages on each of two topics, ``middle`` takes both and publishes
-one for each of the first topic, ``last`` takes all three. Windows and QoS are those of the nodes.
+one for each of the first topic, ``last`` takes all three and prints how many a second they were.
+Windows and QoS are those of the nodes.
 """
 
 import sys
@@ -53,6 +54,7 @@ def main(role, count):
             for publisher in outs:
                 publish(publisher, i)
     left = {id(s): count for s in ins}
+    began = 0.0
     while any(left.values()):
         taken = 0
         for s in ins:
@@ -64,6 +66,9 @@ def main(role, count):
                     left[id(s)] -= 1
         if not taken:
             time.sleep(NAP)
+        began = began or (time.monotonic() if taken else 0.0)
+    if role == "last":
+        print(len(ins) * count / (time.monotonic() - began))
     for p in outs:
         p.wait_for_all_acked(Duration(seconds=60))
     with ends_within(LEAVING, 0):

@@ -147,11 +147,14 @@ def replay_once(checkout, bag, stamps, seconds, folder):
 
 
 def bound_once(count):
-    """CPU seconds of the three processes of publish_and_take."""
+    """The three processes of publish_and_take: (messages per second, {role: CPU seconds})."""
     domain = {"ROS_DOMAIN_ID": "99", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    return watch({role: subprocess.Popen(
+    processes = {role: subprocess.Popen(
         [sys.executable, "-m", "benchmarks.publish_and_take", role, str(count)], cwd=HERE,
-        env=os.environ | domain | {"PYTHONPATH": str(HERE)}) for role in reversed(BOUND)})
+        env=os.environ | domain | {"PYTHONPATH": str(HERE)}, stdout=subprocess.PIPE, text=True)
+        for role in reversed(BOUND)}
+    used = watch(processes)
+    return float(processes[BOUND[-1]].communicate()[0]), used
 
 
 def work_alone(bag, folder):
@@ -247,7 +250,7 @@ def live_once(checkout, bag, nodes_there, folder):
     for output, source in (("/imu/data", "/imu/data_raw"),
                            ("/acceleration_field/imu", "/accelerometers/back")):
         made, came = times.get(output, {}), times.get(source, {})
-        if made and checkout is not None:
+        if made:
             begin = min(made) + STARTED
             delays[output] = [(made[s] - came[s]) * 1e-6 for s in made if s in came and s > begin]
     return share, delays
@@ -261,8 +264,9 @@ def at_rate_zero(checkouts, runs, folder):
     found = {name: [] for name in checkouts}
     bounds = []
     for _ in range(runs):
-        bounds.append(per_100_000(bound_once(RATE * LONG), bound_once(RATE * SHORT), BOUND))
-        print("bound", bounds[-1], flush=True)
+        long, short = (bound_once(RATE * s) for s in (LONG, SHORT))
+        bounds.append((long[0], per_100_000(long[1], short[1], BOUND)))
+        print("bound", *bounds[-1], flush=True)
         for name, checkout in checkouts.items():
             long, short = (replay_once(checkout, folder / "bag", stamps, s, folder)
                            for s in (LONG, SHORT))
@@ -277,10 +281,12 @@ def at_rate_zero(checkouts, runs, folder):
             + ", ".join(f"{s:.0f}" for s in speeds) + " | "
             + ", ".join(f"{c:.1f}" for c in cpu) + f" | {cpu.sum():.1f} | "
             + ", ".join(f"{row[3]:.1f}" for row in rows) + " |")
-    for label, cpu in (("bytes published and taken, no work", np.median(bounds, axis=0)),
-                       ("the work in one process, nothing published or taken",
-                        work_alone(folder / "bag", folder))):
-        lines.append(f"| {label} | | | " + ", ".join(f"{c:.1f}" for c in cpu)
+    cpus = np.median([cpu for _, cpu in bounds], axis=0), work_alone(folder / "bag", folder)
+    for label, speed, cpu in (
+            ("bytes published and taken, no work",
+             f"{statistics.median(speed for speed, _ in bounds):.0f}", cpus[0]),
+            ("the work in one process, nothing published or taken", "", cpus[1])):
+        lines.append(f"| {label} | | {speed} | " + ", ".join(f"{c:.1f}" for c in cpu)
                      + f" | {cpu.sum():.1f} | |")
     return lines
 

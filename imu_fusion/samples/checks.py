@@ -15,6 +15,7 @@ import numpy as np
 from imu_fusion.errors import shown
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import AccelerometerLog, FixLog, ImuLog, MagLog
+from imu_fusion.samples.travel import check_alternating
 from imu_fusion.samples.turning import check_turning
 
 # Longer than this many usual intervals: at least one sample is missing.
@@ -384,7 +385,9 @@ def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
     if null:
         result.append(Finding("fix", f"{name}: {null} positions are 0 deg, 0 deg: a receiver "
                                      "without a fix that says it has one; they are left out"))
-    return result + _check_coarse(log[log.usable], name)
+    usable = log[log.usable]
+    return [*result, *check_held(position[log.usable], usable.stamp, name),
+            *check_alternating(usable, name), *_check_coarse(usable, name)]
 
 
 def _check_coarse(log, name):

@@ -154,13 +154,16 @@ class OrientationStream(Stream):
         """Say once that the body may have turned by more than linear errors describe in a gap."""
         if not len(stamps) or self._said_lost:
             return
-        first = stamps[0] if self._last_imu is None else self._last_imu
-        longest = float(np.diff(stamps, prepend=first).max()) * 1e-9
+        first = int(stamps[0])
+        longest = first - (first if self._last_imu is None else self._last_imu)
+        if len(stamps) > 1:
+            longest = max(longest, int((stamps[1:] - stamps[:-1]).max()))
         self._last_imu = int(stamps[-1])
-        turn = unseen_turn(self.params, longest)
+        seconds = longest * 1e-9
+        turn = unseen_turn(self.params, seconds)
         if turn > LOST and not self.params.fusion.use_acc:
             self._said_lost = True
-            self.warn(f"{IMU_TOPIC}: nothing for {longest:.2f} s, in which the body may have "
+            self.warn(f"{IMU_TOPIC}: nothing for {seconds:.2f} s, in which the body may have "
                       f"turned by {turn:.1f} rad (gap.rate_sd): from there on only the direction "
                       "of the field is known of its orientation, and nothing of the turn about "
                       "it. The smoother knows more, where there are fixes or a surface")

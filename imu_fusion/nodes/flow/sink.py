@@ -257,8 +257,9 @@ class Sink:
     def take(self) -> Turn:
         """One turn: all that waits on all topics."""
         in_session = bool(self.feeding())
-        if self.woken:
-            time.sleep(NAP if in_session else self._nap)
+        nap = NAP if in_session else self._nap
+        if self.woken and nap:  # even none at all would last for 60 us
+            time.sleep(nap)
         self.woken = False
         turn = Turn()
         if self._begun:

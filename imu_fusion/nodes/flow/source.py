@@ -24,7 +24,7 @@ from imu_fusion.nodes.flow.qos import (
 )
 from imu_fusion.nodes.flow.state import BEGIN, END, MARK, Joined, Sending, Sent
 
-WINDOW = 500  # messages of a topic sent before all must be acknowledged: see fastdds.xml
+WINDOW = 900  # messages of a topic sent before all must be acknowledged: see fastdds.xml
 WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
