@@ -139,7 +139,7 @@ def test_correlation_does_not_depend_on_what_is_stated():
     rng = np.random.default_rng(1)
     white = [correlation(rng.standard_normal((150, 3))) for _ in range(200)]
     assert np.count_nonzero(white) < 4    # a thousandth of 600 components
-    slow = gauss_markov((150, 3), 1.0, 10.0, 1.0, rng)
+    slow = gauss_markov(np.arange(150.0), [1.0] * 3, 10.0, rng)
     assert correlation(slow) == pytest.approx(np.exp(-0.1), abs=0.15)
     assert correlation(0.3 * slow) == pytest.approx(correlation(slow))
     assert correlation(0.01 * slow) == 0.0    # less than the mean of 150 is sure: .08
@@ -151,7 +151,8 @@ def test_errors_of_a_minute_show_in_means_over_longer_times():
     white = rng.standard_normal((600, 3))
     assert wandering(stamp, white) == 1.0
     # .3 over a minute: a twentieth in the variance of means over 5 s, half of those over 80 s.
-    assert wandering(stamp, white + 0.3 * gauss_markov((600, 3), 1.0, 60.0, 1.0, rng)) > 2.0
+    assert wandering(stamp, white + 0.3 * gauss_markov(
+        np.arange(600.0), [1.0] * 3, 60.0, rng)) > 2.0
 
 
 def walked(seconds, errors, seed):
