@@ -9,7 +9,7 @@ from pathlib import Path
 
 NOT_RUN = {"__init__", "__main__", "table", "data", "jumps", "acceleration_field_cases",
            "readme", "images", "reference", "architecture", "recording_of_all", "fuzz_devices",
-           "smoother_misfits"}    # misfits runs it
+           "smoother_misfits", "misfits_field", "misfits_inputs", "scenarios"}    # misfits runs them
 
 
 def main(names):

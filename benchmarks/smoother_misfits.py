@@ -21,6 +21,7 @@ from imu_fusion.evaluation.consistency import nees
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog
 from imu_fusion.simulation.jump_sensors import record
+from imu_fusion.simulation.noise import gauss_markov
 from imu_fusion.simulation.noise_gnss import GnssErrors
 from imu_fusion.simulation.ski_jump import Fall, JumpParams, SkiJump
 from imu_fusion.simulation.walk import FRAME as WALKED
@@ -136,14 +137,6 @@ def shaken(imu, mag, fix, velocity, rng):
                    acc=imu.acc + 0.6 * rng.standard_normal((n, 3))), mag, fix, velocity
 
 
-def wandering(n, dt, rng):
-    """A Gauss-Markov error (n, 3) m."""
-    decay, error = np.exp(-dt / WANDER_TAU), WANDER_SD * rng.standard_normal((n, 3))
-    for k in range(1, n):
-        error[k] = decay * error[k - 1] + np.sqrt(1.0 - decay ** 2) * error[k]
-    return error
-
-
 def car(every: int, with_velocity: bool) -> Callable:
     """The real drive with a receiver whose fixes wander, one in ``every`` of them."""
     def run(row):
@@ -152,7 +145,8 @@ def car(every: int, with_velocity: bool) -> Callable:
         enu = frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height)
         for seed in range(2):
             rng, n = np.random.default_rng(seed), len(fix)
-            off = wandering(n, 0.25, rng) + WHITE_SD * rng.standard_normal((n, 3))
+            off = gauss_markov(0.25 * np.arange(n), WANDER_SD, WANDER_TAU, rng)
+            off += WHITE_SD * rng.standard_normal((n, 3))
             worse = FixLog(fix.stamp, *frame.to_geodetic(enu + off),
                            np.broadcast_to(STATED_SD ** 2 * np.eye(3), (n, 3, 3)), fix.status)
             result = Smoother(DEFAULTS).run(imu, None, worse[::every],
@@ -167,9 +161,10 @@ def withheld(row):
     row.add(error, cov, result.remarks())
 
 
-def walks(outages: bool, with_velocity: bool = True, **errors) -> Callable:
-    """Walks of 134 s; error of the antenna in the middle of the recording without fixes for three
-    times 15 s, or over all of it."""
+def walks(outages: bool, with_velocity: bool = True,
+          change: Callable = lambda fix, velocity: (fix, velocity), **errors) -> Callable:
+    """Walks of 134 s with fixes and velocities changed; error of the antenna in the middle of the
+    recording without fixes for three times 15 s, or over all of it."""
     own = WalkErrors(**errors)
 
     def run(row):
@@ -177,10 +172,13 @@ def walks(outages: bool, with_velocity: bool = True, **errors) -> Callable:
             walk = Walk(134.0, np.random.default_rng([seed, 3]))
             recorded = record_walk(walk, np.random.default_rng([seed, 4]), own)
             fix, velocity = recorded.fix, recorded.velocity
+            changed = change(fix, velocity)
             t = (fix.stamp - recorded.imu.stamp[0]) * 1e-9
             hold = outages & (((t - 40.0) % 30.0 < 15.0) & (t > 40.0) & (t < 115.0))
-            result = Smoother(DEFAULTS).run(recorded.imu, recorded.mag, fix[~hold],
-                                            velocity[~hold] if with_velocity else None)
+            if outages:
+                changed = tuple(log[~hold] for log in changed)
+            result = Smoother(DEFAULTS).run(recorded.imu, recorded.mag, changed[0],
+                                            changed[1] if with_velocity else None)
             samples = at_antenna(result.samples, result.states, DEFAULTS)
             since = (samples["stamp"] - recorded.imu.stamp[0]) * 1e-9
             scored = np.searchsorted(since, t[hold] if outages else t)
@@ -190,6 +188,27 @@ def walks(outages: bool, with_velocity: bool = True, **errors) -> Callable:
             row.add(samples["position_world"][scored] - place, samples["cov_position"][scored],
                     result.remarks())
     return run
+
+
+def apart(fixes, velocities):
+    """Fixes and velocities that are late by s of their own."""
+    def change(*logs):
+        return tuple(replace(log, stamp=log.stamp + round(late * 1e9))
+                     for log, late in zip(logs, (fixes, velocities)))
+    return change
+
+
+def holding(fix, velocity):
+    """For 20 s the receiver holds its last."""
+    held = np.arange(len(fix))
+    held[250:350] = 250
+    return tuple(replace(log[held], stamp=log.stamp) for log in (fix, velocity))
+
+
+def twice(fix, velocity):
+    """Each fix once more, 0.1 s later."""
+    both = fix[np.repeat(np.arange(len(fix)), 2)]
+    return replace(both, stamp=both.stamp + np.tile([0, 100_000_000], len(fix))), velocity
 
 
 def jumps(kind: type[SkiJump], *landings: dict) -> Callable:
@@ -236,6 +255,15 @@ SITUATIONS = (
     ("the same, antenna 0.5 m above the sensor, not given", "",
      walks(True, lever_arm=(0.1, 0.1, 0.5))),
     ("the same, past iron that bends the field by 8 uT", "", walks(True, iron=8e-6)),
+    ("walk, RTK 5 Hz, fixes 2 s early", "2.7 m off, stated .18",
+     walks(False, change=apart(-2.0, 0.0))),
+    ("the same, velocities 2 s late", "2.0 m off, stated .15",
+     walks(False, change=apart(0.0, 2.0))),
+    ("the same, fixes alone, 2 s late", "2.9 m off, stated .49",
+     walks(False, False, apart(2.0, 0.0))),
+    ("the same, the receiver holds its last for 20 s", "5.6 m off, stated .37",
+     walks(False, change=holding)),
+    ("the same, each fix twice, .1 s apart", "NEES 9.5", walks(False, change=twice)),
     ("walk, 1 Hz, fixes of stated 4 m that wander by 3 m", "", walks(False, **PHONE)),
     ("the same, past iron that bends the field by 20 uT", "",
      walks(False, **PHONE, iron=20e-6, iron_length=2.0)),

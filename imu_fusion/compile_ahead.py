@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,9 @@ def _smoother() -> None:
     plane = Plane(LocalFrame(47.0, 11.0, 500.0), 0.0, 0.0, 0.1)
     for method, surface in (("iterated", None), ("iterated", plane), ("extended_rts", None)):
         Smoother(SmootherParams(method=method), surface).run(imu, mag, fix, velocity)
+    # Held on the surface from the first pass on.
+    recovered = replace(imu, gyr_sd=np.full_like(imu.gyr, 0.01))
+    Smoother(SmootherParams(), plane).run(recovered, mag, fix, velocity)
 
 
 def _acceleration_field() -> None:

@@ -50,6 +50,9 @@ def test_iron_and_the_norm_of_the_place_are_found(bag):
     assert found.matrix == pytest.approx(np.linalg.inv(SOFT), abs=2e-3)
     sd = np.sqrt(found.cov.diagonal()[:3])
     assert np.all(np.abs(found.offset - OFFSET) < 4.0 * sd) and sd.max() < 1e-7
+    # The norm before and after: iron of 25 uT over all directions, and the noise.
+    assert found.recorded_sd == pytest.approx(25e-6 / np.sqrt(3.0), rel=0.2)
+    assert found.residual_sd == pytest.approx(2e-7, rel=0.1)
 
 
 def test_the_command_writes_what_both_estimators_read(bag, tmp_path):

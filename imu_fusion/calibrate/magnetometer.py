@@ -61,7 +61,8 @@ def magnetometer_report(found: MagCalibration) -> list[tuple[str, str]]:
     return [("offset, \u00b5T", offset),
             ("scales", ", ".join(f"{v:.4f}" for v in np.diag(found.matrix))),
             ("norm of the field, \u00b5T", f"{1e6 * found.field_norm:.2f}"),
-            ("scatter of the norm, \u00b5T", f"{1e6 * found.residual_sd:.2f}"),
+            ("scatter of the norm as recorded, \u00b5T", f"{1e6 * found.recorded_sd:.2f}"),
+            ("and calibrated, \u00b5T", f"{1e6 * found.residual_sd:.2f}"),
             ("directions seen, %", f"{100 * found.coverage:.0f}"),
             ("condition", f"{found.condition:.1f}"), ("samples", str(found.samples))]
 
@@ -76,5 +77,6 @@ def magnetometer_parameters(found: MagCalibration, bag: str | Path) -> str:
         [f"{found.samples} samples, {100 * found.coverage:.0f} % of the directions, offset good to "
          f"{worst:.2f} uT,", f"norm scatters by {1e6 * found.residual_sd:.2f} uT"],
         {"method": "ellipsoid", "residual_sd": float(found.residual_sd),
+         "recorded_sd": float(found.recorded_sd),
          "condition": float(found.condition), "coverage": float(found.coverage),
          "samples": found.samples, "covariance": [float(v) for v in found.cov.ravel()]})

@@ -51,7 +51,7 @@ def _smooth_in_child(folder):
         with announced_compiling(lambda text: print(f"smoother: {text}", file=sys.stderr)):
             result = smooth(params, logs)
         np.save(folder / _SAMPLES, result.samples)
-        outcome = Outcome.of(result, frame_of(logs))
+        outcome = Outcome.of(result, frame_of(logs), params.gnss.lever_arm)
     except ImuFusionError as error:
         outcome = str(error)
     except KeyboardInterrupt:

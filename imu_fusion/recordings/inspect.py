@@ -17,6 +17,7 @@ from imu_fusion.recordings.logs import LogCollector, undecodable
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import Log
+from imu_fusion.samples.travel import check_travel
 from imu_fusion.samples.turning import check_axes
 
 _HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
@@ -120,8 +121,10 @@ def _conclude(reader: Reader, collectors: "Mapping[str, LogCollector | _Stamps]"
                            collector.report(name, msgtype))
         imus = [report.log for report in reports
                 if isinstance(report.log, ImuLog) and report.count]
+        fixes = [report.log for report in reports
+                 if isinstance(report.log, FixLog) and report.count]
         for report in reports:
-            whole[report.topic].add(_beside(report, imus))
+            whole[report.topic].add(_beside(report, imus, fixes))
 
 
 class _Stretches:
@@ -206,14 +209,18 @@ def inspect_log(name: str, msgtype: str, log: Log) -> TopicReport:
                        tuple(r for r in ranges if r is not None), tuple(findings), log=log)
 
 
-def _beside(report, imus):
-    """Add whether a sensor has the time of the only Imu of the recording, and how a magnetometer
-    turns against it."""
-    if report.log is None or len(imus) != 1 or isinstance(report.log, ImuLog):
+def _beside(report, imus, fixes):
+    """Add whether a sensor has the time of the only Imu of the recording, how a magnetometer turns
+    against it, and whether velocities lead from one to another of the only fixes."""
+    if report.log is None or isinstance(report.log, ImuLog):
         return report
-    found = checks.check_clock(report.log.stamp, imus[0].stamp, report.topic)
-    if isinstance(report.log, MagLog):
-        found += check_axes(imus[0], report.log, report.topic)
+    found = []
+    if len(imus) == 1:
+        found += checks.check_clock(report.log.stamp, imus[0].stamp, report.topic)
+        if isinstance(report.log, MagLog):
+            found += check_axes(imus[0], report.log, report.topic)
+    if len(fixes) == 1 and isinstance(report.log, VelocityLog):
+        found += check_travel(fixes[0], report.log, report.topic)
     return replace(report, findings=(*report.findings, *found))
 
 

@@ -141,8 +141,9 @@ def slope_section(slope: Slope, mag: MagLog | None) -> Section:
     if mag is not None and len(mag):
         blocks.append(Figure(
             time_figure(_field(slope, mag), slope.shades, 150),
-            "The field as the attitudes carry it into the world, and the lines of the World "
-            "Magnetic Model. This check (25)-(27) is blind to a turn about the field, which is "
+            "The field as the attitudes carry it into the world, its strength also before the "
+            "calibration of the magnetometer, and the lines of the World Magnetic Model. This "
+            "check (25)-(27) is blind to a turn about the field, which is "
             "most of the heading where the field is steep."))
     if reckoned is not None:
         blocks += in_situ_blocks(reckoned)
@@ -319,7 +320,10 @@ def _field(slope, mag):
     time = slope.time[ours]
     panels = []
     for k, label in enumerate(("strength in µT", "inclination in °", "declination in °")):
-        items: list[Line | Band] = [Line("measured", time, fig.break_wraps(found[k]), fig.LIGHT)]
+        items: list[Line | Band] = [Line("calibrated", time, fig.break_wraps(found[k]), fig.LIGHT)]
+        if k == 0:
+            items.insert(0, Line("as recorded", time, 1e6 * np.linalg.norm(mag.mag[own], axis=1),
+                                 fig.HIGHLIGHT, width=1.0))
         if model is not None:
             items.append(Line("field model", time[[0, -1]], np.repeat(model[k], 2),
                               fig.REFERENCE, "dash"))

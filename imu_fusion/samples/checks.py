@@ -13,8 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.errors import shown
+from imu_fusion.samples.disagreement import check_agreement
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import AccelerometerLog, FixLog, ImuLog, MagLog
+from imu_fusion.samples.standing import check_standing
+from imu_fusion.samples.travel import check_alternating
 from imu_fusion.samples.turning import check_turning
 
 # Longer than this many usual intervals: at least one sample is missing.
@@ -313,7 +316,8 @@ def check_gravity_sign(acc: np.ndarray, stamp: np.ndarray, name: str) -> list[Fi
     """A finding if the quietest specific force (n, 3) points along -z."""
     force = _quiet_mean(acc, stamp)
     size = float(np.linalg.norm(force))
-    if not force[2] < -_UPSIDE_DOWN * size:
+    # Quiet moments that point everywhere are no rest.
+    if not force[2] < -_UPSIDE_DOWN * size or size < _UPSIDE_DOWN * _quiet_norm(acc, stamp):
         return []
     return [Finding("axes", f"{name}: at rest -z is up ({force[2]:.4g} of {size:.4g} m/s^2): the "
                             "sensor lies upside down, or the sign of the specific force is "
@@ -353,7 +357,8 @@ def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
             *check_parts(log.gyr, log.acc, name),
             *check_acceleration(log.acc, log.stamp, name),
             *check_gravity_sign(log.acc, log.stamp, name),
-            *check_turning(log, name),
+            *(check_standing(log, name) or check_turning(log, name)
+              or check_agreement(log, name)),
             *check_held(np.hstack([log.gyr, log.acc]), log.stamp, name),
             *check_saturation(log.gyr, name, "angular velocity", "rad/s"),
             *check_saturation(log.acc, name, "acceleration", "m/s^2")]
@@ -384,7 +389,9 @@ def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
     if null:
         result.append(Finding("fix", f"{name}: {null} positions are 0 deg, 0 deg: a receiver "
                                      "without a fix that says it has one; they are left out"))
-    return result + _check_coarse(log[log.usable], name)
+    usable = log[log.usable]
+    return [*result, *check_held(position[log.usable], usable.stamp, name),
+            *check_alternating(usable, name), *_check_coarse(usable, name)]
 
 
 def _check_coarse(log, name):

@@ -108,6 +108,10 @@ class Windows:
     def __len__(self) -> int:
         return len(self.rates)
 
+    def keep(self, which: np.ndarray) -> None:
+        """Only those of these numbers."""
+        self.rates, self.vectors = self.rates[which], self.vectors[which]
+
     def _turned(self) -> np.ndarray:
         """Greatest angle (w,) between the means of four parts of each window."""
         parts = [part.mean(axis=1) for part in np.array_split(self.vectors, 4, axis=1)]
@@ -169,9 +173,9 @@ def gravity_verdict(imu: ImuLog) -> Verdict:
     simple = spread_of(scale, np.eye(3))
     if simple.sum() < 1.2 * best.sum():
         best, axes = simple, np.eye(3)
-    if scale == 1.0 and not _is_better(best, recorded):
+    if scale == 1.0 and not is_better(best, recorded):
         best, axes = _best_rotation(lambda axes: spread_of(1.0, axes), axes)
-    if not _is_better(best, recorded):
+    if not is_better(best, recorded):
         return Verdict("unknown")
     if scale != 1.0:
         return Verdict("rates in deg/s", axes)
@@ -199,21 +203,22 @@ def field_verdict(imu: ImuLog, mag: MagLog) -> Verdict:
     found = [(spread(turns, windows.vectors @ axes.T, with_bias=True), axes)
              for axes in signed_permutations()]
     best, axes = min(found, key=lambda each: each[0].sum())
-    if not _is_better(best, recorded):
+    if not is_better(best, recorded):
         best, axes = _best_rotation(
             lambda axes: spread(turns, windows.vectors @ axes.T, with_bias=True), axes)
-    if not _is_better(best, recorded):
+    if not is_better(best, recorded):
         return Verdict("unknown")
     verdict = Verdict("axes", axes)
     return Verdict("unknown") if verdict.angle < _LEAST_TURN else verdict
 
 
-def _is_better(best, recorded):
+def is_better(best: np.ndarray, recorded: np.ndarray) -> bool:
     """Whether a hypothesis leaves so much less of the spread (w,), window by window, that neither
     accelerations nor the choice among many explain it."""
     gain = np.log(recorded) - np.log(best)
     proof = gain.mean() * np.sqrt(len(gain)) / max(float(gain.std()), 0.1)
-    return best.sum() < _BETTER * recorded.sum() and proof > _PROOF and np.mean(gain > 0) >= _SHARE
+    return bool(best.sum() < _BETTER * recorded.sum() and proof > _PROOF
+                and np.mean(gain > 0) >= _SHARE)
 
 
 def _best_rotation(spread_of, axes):

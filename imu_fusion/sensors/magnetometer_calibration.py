@@ -33,7 +33,8 @@ class MagCalibration:
 
     offset (3,) tesla; matrix (3, 3) symmetric; field_norm tesla; cov (9, 9) of offset
     (tesla) and of the matrix' upper triangle row by row; residual_sd: scatter of the
-    calibrated norm, tesla; coverage: share of the directions that were seen;
+    calibrated norm, tesla, and recorded_sd of the norm as recorded (Winkler 2025, Fig. 9 has both);
+    coverage: share of the directions that were seen;
     condition: of the scaled normal equations' Jacobian; samples: how many were used.
     """
 
@@ -42,6 +43,7 @@ class MagCalibration:
     field_norm: float
     cov: np.ndarray
     residual_sd: float
+    recorded_sd: float
     coverage: float
     condition: float
     samples: int
@@ -175,7 +177,8 @@ def calibrate_magnetometer(mag: np.ndarray, field_norm: float | None = None) -> 
     units = np.concatenate([np.full(3, unit), np.full(6, factor)])
     return MagCalibration(
         offset=estimate[:3] * unit, matrix=matrix * factor, field_norm=radius * unit * factor,
-        cov=cov * np.outer(units, units), residual_sd=spread * unit * factor, coverage=seen,
+        cov=cov * np.outer(units, units), residual_sd=spread * unit * factor,
+        recorded_sd=float(np.linalg.norm(kept, axis=1).std()) * unit, coverage=seen,
         condition=condition, samples=len(kept))
 
 

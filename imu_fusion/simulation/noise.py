@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
 from imu_fusion.errors import SampleError
@@ -40,12 +41,16 @@ def ornstein_uhlenbeck(size: int, dt: float, beta: float, sigma: float,
     return lfilter([1.0], [1.0, -decay], drive, axis=0)
 
 
-def gauss_markov(size: int, dt: float, time_constant: float, sd: float,
+def gauss_markov(times: np.ndarray, sd: ArrayLike, tau: float,
                  rng: np.random.Generator) -> np.ndarray:
-    """First-order Gauss-Markov processes of stationary ``sd`` and correlation time, s.
-
-    The same process as :func:`ornstein_uhlenbeck` in the terms of navigation. Returns an array
-    of shape ``size``, first axis time.
-    """
-    beta = 1.0 / time_constant
-    return ornstein_uhlenbeck(size, dt, beta, sd * math.sqrt(2 * beta), rng)
+    """Samples (n, k) of first-order Gauss-Markov errors at times (n,) s: stationary standard
+    deviation sd (k,), correlation exp(-dt/tau); the process above in the terms of navigation, at
+    any times."""
+    each = np.asarray(sd, dtype=float)
+    error = np.empty((len(times), len(each)))
+    error[0] = each * rng.standard_normal(len(each))
+    for i, dt in enumerate(np.diff(times)):
+        keep = np.exp(-dt / tau)
+        error[i + 1] = (keep * error[i]
+                        + each * np.sqrt(1.0 - keep * keep) * rng.standard_normal(len(each)))
+    return error

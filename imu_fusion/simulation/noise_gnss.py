@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.simulation.noise import gauss_markov
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,6 @@ class GnssErrors(Parameters):
     outlier_factor: float = param(10.0, doc="Standard deviations of an outlier, in units of "
                                   "the nominal ones", low=1)
     time_offset: float = param(0.0, doc="The receiver's stamps are late by this", unit="s")
-
-
-def gauss_markov(times: np.ndarray, sd: ArrayLike, tau: float,
-                 rng: np.random.Generator) -> np.ndarray:
-    """Samples (n, k) of first-order Gauss-Markov errors at times (n,) s: stationary standard
-    deviation sd (k,), correlation exp(-dt/tau)."""
-    each = np.asarray(sd, dtype=float)
-    error = np.empty((len(times), len(each)))
-    error[0] = each * rng.standard_normal(len(each))
-    for i, dt in enumerate(np.diff(times)):
-        keep = np.exp(-dt / tau)
-        error[i + 1] = (keep * error[i]
-                        + each * np.sqrt(1.0 - keep * keep) * rng.standard_normal(len(each)))
-    return error
 
 
 def _errors(times, sd, tau, share, rng):

@@ -137,8 +137,8 @@ def _read(true, errors, bias_sd, density, rng):
     """Readings (n, 3) of an inertial sensor."""
     matrix = np.eye(3) + errors.axes_sd * rng.standard_normal((3, 3))
     matrix[np.diag_indices(3)] = 1.0 + errors.scale_sd * rng.standard_normal(3)
-    wander = gauss_markov(true.shape[0], 1.0 / errors.rate, errors.bias_tau, 0.1 * bias_sd, rng)
-    return (true @ matrix.T + bias_sd * rng.standard_normal(3) + wander[:, None]
+    wander = gauss_markov(np.arange(len(true)) / errors.rate, [0.1 * bias_sd], errors.bias_tau, rng)
+    return (true @ matrix.T + bias_sd * rng.standard_normal(3) + wander
             + density * np.sqrt(errors.rate) * rng.standard_normal(true.shape))
 
 

@@ -12,7 +12,7 @@ from imu_fusion.estimation.orientation.estimator import (
     OrientationEstimator,
     OrientationParams,
 )
-from imu_fusion.estimation.orientation.lost_turn import LOST, unseen_turn
+from imu_fusion.estimation.orientation.lost_turn import LOST, is_blind, unseen_turn
 from imu_fusion.estimation.orientation.mag_screen import MagScreen
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
@@ -160,6 +160,12 @@ class OrientationStream(Stream):
             longest = max(longest, int((stamps[1:] - stamps[:-1]).max()))
         self._last_imu = int(stamps[-1])
         seconds = longest * 1e-9
+        if seconds > self.params.gap.restart and is_blind(self.params, at_rest=False):
+            self._said_lost = True
+            self.warn(f"{IMU_TOPIC}: nothing for {seconds:.2f} s, after which all starts anew "
+                      "(gap.restart): unless the body lies still then, nothing is known of its "
+                      "orientation from there on. The smoother knows more, where there are fixes "
+                      "or a surface")
         turn = unseen_turn(self.params, seconds)
         if turn > LOST and not self.params.fusion.use_acc:
             self._said_lost = True

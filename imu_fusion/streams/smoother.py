@@ -150,7 +150,7 @@ class SmootherStream(Stream):
         (SmootherResult, logs by topic)."""
         logs = self.logs()
         result = smooth(self.params, logs)
-        outcome = Outcome.of(result, frame_of(logs))
+        outcome = Outcome.of(result, frame_of(logs), self.params.gnss.lever_arm)
         return Conclusion(messages(result.samples, outcome, self.params),
                           outcome.numbers, outcome.summary, outcome.remarks, (result, logs))
 

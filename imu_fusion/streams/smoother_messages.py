@@ -1,7 +1,7 @@
 """A smoothed trajectory as messages, and what a result says in words and numbers."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -39,8 +39,8 @@ def outputs_of(params: SmoothingParams) -> dict[str, str]:
 
 _SI = {"µT": "T", "%": "1", "ms": "s", "°": "rad"}    # of units in reports
 UNITS = {
-    "latitude_deg": "deg", "longitude_deg": "deg", "height": "m", "gnss_lag": "s", "offset": "m",
-    "stamp": "ns", "duration": "s",
+    "latitude_deg": "deg", "longitude_deg": "deg", "height": "m", "gnss_lag": "s",
+    "velocity_lag": "s", "offset": "m", "antenna": "m", "stamp": "ns", "duration": "s",
     **dict.fromkeys(("takeoff_stamp", "touchdown_stamp"), "ns"),
     **dict.fromkeys(("in_run_speed", "takeoff_speed", "landing_speed"), "m/s"),
     "takeoff_angle_deg": "deg", "flight_time": "s", "length": "m",
@@ -61,13 +61,20 @@ class Outcome:
     frame_id: str
 
     @classmethod
-    def of(cls, result: SmootherResult, frame_id: str) -> Self:
-        """Of a SmootherResult."""
+    def of(cls, result: SmootherResult, frame_id: str, lever_arm: Sequence[float] = (0.0, 0.0, 0.0)
+           ) -> Self:
+        """Of a SmootherResult; lever_arm (3,) m that was given of the antenna."""
+        # A receiver alone speaks of its antenna.
+        given = lever_arm if result.acc_density is None else (0.0, 0.0, 0.0)
+        antenna, _ = result.states.get("gnss_lever_arm", (np.array([given]), None))
         numbers: dict[str, Any] = {
             "units": UNITS, "samples": len(result.samples), "origin": asdict(result.frame),
+            # All positions and velocities are those of the first; the second is in its axes.
+            "point": frame_id, "antenna": [float(v) for v in antenna[0]],
             "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
+            "velocity_lag": result.velocity_lag, "repeats": result.repeats,
             "adapted": result.adapted, "noise": result.noise,
             "acc_density": result.acc_density,
             "states": {name: {"value": value.tolist(), "sd": sd.tolist()}

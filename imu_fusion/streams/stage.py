@@ -10,16 +10,19 @@ from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import ParamsFile, parameters_for
 from imu_fusion.samples import checks
 from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.travel import check_travel
 from imu_fusion.samples.turning import check_axes
-from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC
+from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC, VELOCITY_TOPIC
 
 
 def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
-    """What looks wrong with whole logs as recorded, Imu, magnetometer and fixes by topic."""
+    """What looks wrong with whole logs as recorded, of Imu, magnetometer and receiver by topic."""
     imu, mag = logs.get(IMU_TOPIC), logs.get(MAG_TOPIC)
     found = [] if imu is None else checks.check_imu(imu, IMU_TOPIC)
     if FIX_TOPIC in logs:
         found += checks.check_fix(logs[FIX_TOPIC])
+    if FIX_TOPIC in logs and VELOCITY_TOPIC in logs:
+        found += check_travel(logs[FIX_TOPIC], logs[VELOCITY_TOPIC], VELOCITY_TOPIC)
     if mag is not None:
         found += checks.check_mag(mag, MAG_TOPIC)
     if imu is not None and mag is not None:

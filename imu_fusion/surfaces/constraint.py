@@ -25,7 +25,8 @@ class Constraint:
     ``evaluate(position_world)`` takes (n, 3) m in the surface's own east-north-up frame
     and returns the residual (n,) m, NaN where it does not apply, and its gradient (n, 3).
     A residual that is a ``height`` is positive above the surface, and the body's height
-    above the ground is taken from it.
+    above the ground is taken from it. ``rough``: within what a position is unsure by, the surface
+    may be anything but plane.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Constraint:
     sigma: float
     height: bool
     evaluate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    rough: bool = False
 
     def __post_init__(self) -> None:
         if self.phase not in PHASES:

@@ -197,4 +197,4 @@ class ElevationGrid(Surface):
 
     def constraints(self) -> tuple[Constraint, ...]:
         sigma = split_sigma(self.sigma, PARTS)["elevation_grid"]
-        return (Constraint("elevation_grid", "always", sigma, True, self._evaluate),)
+        return (Constraint("elevation_grid", "always", sigma, True, self._evaluate, rough=True),)

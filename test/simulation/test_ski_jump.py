@@ -6,7 +6,8 @@ from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.simulation.jump_sensors import EPOCH, PhoneErrors, period_means, record
-from imu_fusion.simulation.noise_gnss import GnssErrors, gauss_markov, gnss_errors
+from imu_fusion.simulation.noise import gauss_markov
+from imu_fusion.simulation.noise_gnss import GnssErrors, gnss_errors
 from imu_fusion.simulation.ski_jump import JumpParams, SkiJump
 from imu_fusion.surfaces.file import load_surface
 

@@ -192,8 +192,9 @@ class AccelerationFieldEstimator:
         if self._filter is None and self._stamps:
             raise EstimationError(
                 f"the body was never still for {self.params.initial.duration} s, as it has to be "
-                "with initial.mode rest, and where the clock was set; give initial.orientation and "
-                "initial.angular_velocity with initial.mode given, or raise initial.still_sd")
+                "with initial.mode rest, and where the clock was set, or what it felt was not "
+                "gravity (units?); give initial.orientation and initial.angular_velocity with "
+                "initial.mode given, or raise initial.still_sd")
         if self.params.mode != "smoothed":
             return np.empty(0, ROW)
         if not self._stamps:
@@ -294,5 +295,6 @@ class AccelerationFieldEstimator:
         return rest_start(params, self.array, self._rest)
 
     def _make_filter(self, start):
-        kind = RigidBodyFilter if self.params.method == "rigid_body" else AffineFilter
-        return kind(self.params, self.array, start)
+        if self.params.method == "rigid_body":
+            return RigidBodyFilter(self.params, self.array, start, asks=True)
+        return AffineFilter(self.params, self.array, start)

@@ -18,6 +18,13 @@ from imu_fusion.estimation.acceleration_field.cross_check import (
     linearise_well,
     make_workspace,
 )
+from imu_fusion.estimation.acceleration_field.exact_mounting import (
+    Exact,
+    blend,
+    exact_start,
+    share,
+    weigh,
+)
 from imu_fusion.estimation.acceleration_field.hardly_known_rate import (
     is_hardly_known,
     leave_rate_out,
@@ -122,34 +129,52 @@ def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, wor
 
 
 @njit
-def filter_samples(state, par, channels, stamp, readings, rows, trace, work):
+def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exact, exact_trace,
+                   exact_work):
     """Filter n samples in order, in place; one of ``rows`` (n,) ROW each.
 
     par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, stamp: (n,) int64 ns,
-    readings: (n, m), trace: a Trace of one sample and work: a Workspace, to work in.
+    readings: (n, m), trace: a Trace of one sample and work: a Workspace, to work in; exact: the
+    Exact beside it, with a Trace and a Workspace of its own.
     """
     p = par[0]
-    step = _make_step()
-    at = np.empty_like(state.x)
+    step, exact_step = _make_step(), _make_step()
+    at, exact_at = np.empty_like(state.x), np.empty_like(exact.state.x)
+    other = np.empty_like(rows[:1])
     only = np.int64(0)   # a literal 0 would compile what is called once more
     for n in range(len(stamp)):
-        flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
-        at[:] = state.x
-        found = _correct(state, p, channels, readings[n], at, True, True, step, work, trace, only)
-        _fold(state)
+        flags, found = _filter_one(stamp[n], state, p, channels, readings[n], rows[n], at, step,
+                                   trace, work, only)
+        if exact.odds[0] > -math.inf:
+            _, beside = _filter_one(stamp[n], exact.state, p, exact.channels, readings[n], other[0],
+                                    exact_at, exact_step, exact_trace, exact_work, only)
+            weigh(exact.odds, found.log_likelihood, beside.log_likelihood, work.use, exact_work.use)
+            part = share(exact.odds[0])
+            if part > 0.0:
+                blend(rows[n], other[0], part)
         flags |= found.flags
         residual = math.nan
         if found.used > 0:
             residual = math.sqrt(found.squares / found.used)
         else:
             flags |= HELD
-        s = parts(state.x)
-        row = rows[n]
-        row.stamp = stamp[n]
-        row.flags = flags
-        row.residual_rms = residual
-        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc,
-                      np.ascontiguousarray(state.cov[:BIAS, :BIAS]))
+        rows[n].stamp = stamp[n]
+        rows[n].flags = flags
+        rows[n].residual_rms = residual
+
+
+@njit
+def _filter_one(stamp, state, p, channels, reading, row, at, step, trace, work, n):
+    """Take one sample into the State, and fill its ROW by that; returns the flags of the step to
+    it, and the Innovations."""
+    flags = _predict_to(stamp, state, p, channels, step, trace, n)
+    at[:] = state.x
+    found = _correct(state, p, channels, reading, at, True, True, step, work, trace, n)
+    _fold(state)
+    s = parts(state.x)
+    put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc,
+                  np.ascontiguousarray(state.cov[:BIAS, :BIAS]))
+    return flags, found
 
 
 @njit
@@ -179,35 +204,46 @@ class RigidBodyFilter:
     """The filter with its memory: a start, then samples in order.
 
     is_adaptive: whether noise and motion may be taken to be larger, see :mod:`.adaptation`.
+    asks: whether the hypothesis that the mounting is exact is followed, see :mod:`.exact_mounting`.
     """
 
     def __init__(self, params: AccelerationFieldParams, array: SensorArray, start: Start,
-                 is_adaptive: bool = True):
+                 is_adaptive: bool = True, asks: bool = False):
         self._par = kernel_params(params, array)
         self._par["is_adaptive"] = is_adaptive
         self._channels = array.channels
         self._one = make_trace(1, len(array.channels), len(start.x))
         self._work = make_workspace(array.channels)
         linearise(array.channels, start.x, self._work)
-        self.state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
-                           np.array([-1], dtype=np.int64), np.zeros(array.accelerometers, CHECK),
-                           np.zeros(1, ADAPTATION), np.zeros(len(array.channels)),
-                           np.zeros(len(array.channels), bool))
-        self.state.adaptation["grace"] = GRACE
+        self.state = _first_state(start, array)
+        beside = array.with_exact_mounting()
+        begun = exact_start(start, array)
+        may_be_off = len(start.x) > len(begun.x)
+        self._exact = Exact(_first_state(begun, beside), beside.channels,
+                            np.full(1, 0.0 if asks and may_be_off else -np.inf))
+        self._exact_one = make_trace(1, len(array.channels), len(begun.x))
+        self._exact_work = make_workspace(beside.channels)
+        linearise(beside.channels, begun.x, self._exact_work)
 
-    def get_state(self) -> State:
+    def get_state(self) -> tuple[State, State, np.ndarray]:
         """A copy of the memory, for :meth:`set_state`."""
-        return State(*(member.copy() for member in self.state))
+        return copied(self.state), copied(self._exact.state), self._exact.odds.copy()
 
-    def set_state(self, state: State) -> None:
+    def set_state(self, state: tuple[State, State, np.ndarray]) -> None:
         """Go on from where :meth:`get_state` was called."""
-        self.state = State(*(member.copy() for member in state))
+        self.state = copied(state[0])
+        self._exact = self._exact._replace(state=copied(state[1]), odds=state[2].copy())
+
+    @property
+    def share_of_exact(self) -> float:
+        """How likely it is, of one, that the mounting is exact."""
+        return float(share(self._exact.odds[0]))
 
     def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
         rows = np.empty(len(stamp), ROW)
         filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._one,
-                       self._work)
+                       self._work, self._exact, self._exact_one, self._exact_work)
         return rows
 
     @property
@@ -221,3 +257,17 @@ class RigidBodyFilter:
         """:func:`trace_samples` with this filter's memory."""
         return trace_samples(self.state, self._par, self._channels, stamp, readings, at, trace,
                              self._work)
+
+
+def copied(state: State) -> State:
+    """A State of its own memory."""
+    return State(*(member.copy() for member in state))
+
+
+def _first_state(start, array):
+    state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
+                  np.array([-1], dtype=np.int64), np.zeros(array.accelerometers, CHECK),
+                  np.zeros(1, ADAPTATION), np.zeros(len(array.channels)),
+                  np.zeros(len(array.channels), bool))
+    state.adaptation["grace"] = GRACE
+    return state

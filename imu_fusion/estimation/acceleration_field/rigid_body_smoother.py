@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from imu_fusion.estimation.acceleration_field.exact_mounting import blend_rows, exact_start
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
     RATE_ROWS,
@@ -25,7 +26,7 @@ from imu_fusion.estimation.acceleration_field.motion_model import (
     transition,
 )
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
-from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter
+from imu_fusion.estimation.acceleration_field.rigid_body_filter import RigidBodyFilter, copied
 from imu_fusion.estimation.acceleration_field.rows import (
     GAP,
     ROW,
@@ -149,6 +150,22 @@ def _add_change(spread, gain, c, touched, rows, changes):
 
 def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, stamp: np.ndarray,
            readings: np.ndarray) -> tuple[np.ndarray, State]:
+    """:func:`smooth_iterated`, beside the hypothesis that the mounting is exact: as far as the
+    filter has not refuted that, its rows count, see :mod:`.exact_mounting`."""
+    rows, last = smooth_iterated(params, array, start, stamp, readings)
+    begun = exact_start(start, array)
+    if len(begun.x) < len(start.x):
+        keeper = RigidBodyFilter(params, array, start, asks=True)
+        keeper.process(stamp, readings)
+        part = keeper.share_of_exact
+        if part > 0.0:
+            others, _ = smooth_iterated(params, array.with_exact_mounting(), begun, stamp, readings)
+            blend_rows(rows, others, part)
+    return rows, last
+
+
+def smooth_iterated(params: AccelerationFieldParams, array: SensorArray, start: Start,
+                    stamp: np.ndarray, readings: np.ndarray) -> tuple[np.ndarray, State]:
     """The iterated smoother: rows (n,) ROW given all samples, and the State after the last one.
 
     The readings are linearised at the smoothed states of the previous iteration (Gauss-Newton on
@@ -182,7 +199,7 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, st
 def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Start,
                 stamp: np.ndarray, readings: np.ndarray,
                 at: np.ndarray) -> Smoothed:
-    """One iteration; the arguments are those of :func:`smooth`.
+    """One iteration; the arguments are those of :func:`smooth_iterated`.
 
     at: (n, N) states to linearise at, or (0, N): at the filter's predictions.
     """
@@ -195,7 +212,7 @@ def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Star
     for i, j in bounds:
         checkpoints.append(keeper.get_state())
         keeper.trace(stamp[i:j], readings[i:j], at[i:j], trace)
-    last = keeper.get_state()
+    last = copied(keeper.state)
     mean = np.empty((len(stamp), size))
     cov = np.empty((len(stamp), BIAS, BIAS))
     used = np.empty((len(stamp), len(channels)), bool)

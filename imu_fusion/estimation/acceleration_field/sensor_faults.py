@@ -14,6 +14,7 @@ _SAMPLES = 10       # left out: fewer are single wild readings, without a cause 
 _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave over
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
+_FAR = 6.0          # of it: a bias, which takes up errors of the motion, too
 _UNLIKELY = 0.01    # chance of mountings that, taken together, are further off: worth a remark
 _WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
 _NOISIER = 1.25     # as much for the noise, if it lasts: data that fit never change it
@@ -110,7 +111,7 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
                else "")
     remarks = [text for fit in fits for text in (fit.fault, *fit.mounting) if text]
     remarks = remarks or _together(fits, array)
-    remarks += _gyro_bias(array, state)
+    remarks += _biases(fits, array, state) + _gyro_bias(array, state) + _gyro_mounting(array, state)
     moved = [fit.name for fit in fits if fit.mounting]
     if len(moved) > len(fits) / 2:
         # Of so many, what they have in common is more likely.
@@ -146,9 +147,25 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
     return remarks
 
 
+def _biases(fits, array, state):
+    """Texts on accelerometers whose biases are far beyond what was said of them."""
+    remarks = []
+    for k, fit in enumerate(fits):
+        own = np.flatnonzero(array.channels["sensor"] == k)
+        bias, sd = state.x[BIAS + own], array.channels["bias_sd"][own[0]]
+        if fit.fault or array.channels["bias_walk"][own[0]] > 0.0 or np.all(
+                np.abs(bias) <= _FAR * sd):
+            continue
+        axes = ", ".join("xyz"[column % 3] for column in array.channels["column"][own])
+        remarks.append(
+            f"accelerometer '{fit.name}' fits best with biases of {_vector(bias, 2)} m/s^2 "
+            f"({axes}), far beyond their sd of {sd:.2g}, so what is stated is too small: calibrate "
+            f"it, or raise accelerometers.{fit.name}.bias_sd")
+    return remarks
+
+
 def _gyro_bias(array, state):
-    """A text on a gyroscope's biases that are far beyond what was said of them. Those of
-    accelerometers take up errors of the motion, too, and say nothing by themselves."""
+    """A text on a gyroscope's biases that are far beyond what was said of them."""
     own = np.flatnonzero(array.channels["is_gyro"])
     if not len(own):
         return []
@@ -158,6 +175,22 @@ def _gyro_bias(array, state):
     return [f"the gyroscope fits best with biases of {_vector(bias, 3)} rad/s: raise "
             "sensor.gyro_bias_sd; or it turned where it was taken to be still, or its unit, axes "
             "or sign are wrong"]
+
+
+def _gyro_mounting(array, state):
+    """A text on a gyroscope's scales or axes that are far beyond what was said of them."""
+    own = array.channels[array.channels["is_gyro"]]
+    if not len(own):
+        return []
+    scale, _ = _states(state, own["scale"])
+    turn, _ = _states(state, own["turn"][0] + np.arange(3))
+    found = []
+    if np.any(np.abs(scale) > _BEYOND * own["scale_sd"][0]):
+        found.append(f"scales that are off by {_vector(100.0 * scale, 1)} % (sensor.gyro_scale_sd)")
+    if np.any(np.abs(turn) > _BEYOND * own["axes_sd"][0]):
+        found.append(f"axes turned by {_vector(np.degrees(turn), 1)} deg (sensor.gyro_axes_sd)")
+    return ["the gyroscope fits best with " + " and ".join(found) + ", so what is stated is too "
+            "small: calibrate it, or raise what is in brackets"] if found else []
 
 
 def _together(fits, array):

@@ -31,6 +31,10 @@ from imu_fusion.geometry.rotation import skew
 
 # How well the still body's kinematic acceleration is known to be zero, m/s^2.
 _STILL_SD = 1e-3
+_LARGEST_BIAS = 0.35    # rad/s (20 deg/s): no gyroscope has more
+_SWAY = 0.15            # rad/s from the first half to the last: a hand does not sway faster
+_STRANGE = 0.2          # of gravity, that scales and a calibration may miss it by
+_SURELY = 4.0           # standard deviations
 
 
 class Start(NamedTuple):
@@ -93,6 +97,11 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
         cov[THETA:OMEGA, THETA:OMEGA] = np.eye(3) - np.outer(up, up)
         constraint[:, THETA:OMEGA] = -skew(target)
     x, cov = _update(x, cov, constraint, target, np.eye(3) * _STILL_SD ** 2)
+    return folded(x, cov, quat)
+
+
+def folded(x: np.ndarray, cov: np.ndarray, quat: np.ndarray) -> Start:
+    """A Start whose theta is in its quaternion."""
     turn = scipy.spatial.transform.Rotation.from_rotvec(parts(x).theta)
     quat = (scipy.spatial.transform.Rotation.from_quat(quat) * turn).as_quat()
     parts(x).theta[:] = 0.0
@@ -132,23 +141,59 @@ def _still_rows(array, mean, use, size):
 
 
 def is_still(params: AccelerationFieldParams, array: SensorArray, readings: np.ndarray) -> bool:
-    """Whether every channel of ``readings`` (n, m) varies by less than ``initial.still_sd``
-    (accelerometers) or ``initial.angular_velocity_sd`` (gyroscope) beyond its noise, and so do the
-    means of its halves: a slow turn goes under in strong noise, but not in these."""
+    """Whether a body is still by its ``readings`` (n, m) of ``initial.duration``.
+
+    Every channel varies by less than ``initial.still_sd`` (accelerometers) or
+    ``initial.angular_velocity_sd`` (gyroscope) beyond its noise, and so do the means of its halves:
+    a slow turn goes under in strong noise, but not in these. No gyroscope reports more than a bias
+    may be; what all accelerometers have in common does not turn, and is about as large as gravity.
+    A steady turn about the vertical feels the same: only a gyroscope, or a fast one, tells it.
+    """
     channels = array.channels
     seen = np.where(np.isfinite(readings), readings, np.nan)
     use = np.isfinite(seen).sum(axis=0) > 1
     if not np.any(use):
         return False
     noise = params.noise_scale * channels["density"] * np.sqrt(params.sample_rate)
-    still = np.where(channels["is_gyro"], params.initial.angular_velocity_sd,
-                     params.initial.still_sd)
+    is_gyro = channels["is_gyro"]
+    still = np.where(is_gyro, params.initial.angular_velocity_sd, params.initial.still_sd)
     if not np.all(np.nanstd(seen[:, use], axis=0) < (still + 2 * noise)[use]):
         return False
     first, last = (np.nansum(half, axis=0) / np.maximum(np.isfinite(half).sum(axis=0), 1)
                    for half in np.array_split(seen[:, use], 2))
     chance = 4.0 * noise * np.sqrt(4.0 / len(readings))
-    return bool(np.all(np.abs(last - first) < (2 * still + chance)[use]))
+    if not np.all(np.abs(last - first) < (2 * still + chance)[use]):
+        return False
+    if np.any(np.isposinf(readings[:, is_gyro])):    # at its range
+        return False
+    rates = use & is_gyro
+    largest = np.maximum(_LARGEST_BIAS, _SURELY * channels["bias_sd"])
+    if np.any(np.abs(np.nanmean(seen[:, rates], axis=0)) > largest[rates]):
+        return False
+    return not array.specific_force or params.gravity == 0.0 or _feels_gravity_alone(
+        params, channels, noise, np.nanmean(seen, axis=0), use, last - first, len(readings))
+
+
+def _feels_gravity_alone(params, channels, noise, mean, use, moved, samples):
+    """Whether what most tri-axial accelerometers feel stands still and is about gravity, by the
+    ``mean`` (m,) of the channels in ``use`` (m,), and what those have ``moved`` by."""
+    change = np.zeros(len(use))
+    change[use] = moved
+    forces, turns = [], []
+    for sensor in np.unique(channels["sensor"][~channels["is_gyro"]]):
+        own = (channels["sensor"] == sensor) & use
+        if own.sum() == 3:
+            forces.append(np.linalg.norm(mean[own]))
+            turns.append(np.linalg.norm(change[own]))
+    if not forces:
+        return True
+    felt = ~channels["is_gyro"]
+    chance = np.median(noise[felt]) * np.sqrt(3.0 * 4.0 / samples)
+    bias = np.median(channels["bias_sd"][felt])
+    return bool(np.median(turns) < params.gravity * _SWAY * 0.5 * params.initial.duration
+                + _SURELY * chance
+                and abs(np.median(forces) - params.gravity)
+                < _STRANGE * params.gravity + _SURELY * bias)
 
 
 def normalized(quat: Sequence[float]) -> np.ndarray:

@@ -11,7 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
-from imu_fusion.estimation.orientation.mag_rejection import are_saturated, new_limit
+from imu_fusion.estimation.orientation.mag_rejection import (
+    are_saturated,
+    is_mag_sample,
+    new_limit,
+)
 from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
 from imu_fusion.kernels import njit
@@ -75,6 +79,29 @@ def triad(acc: np.ndarray, mag: np.ndarray, declination: float) -> np.ndarray:
     return np.array([east, north, up])
 
 
+def within_range(mag: np.ndarray, par: np.ndarray) -> np.ndarray:
+    """Mask (m,) of samples (m, 3) tesla with no axis at its limit, also of those before the limit
+    was recognised."""
+    found = new_limit(par)
+    are_saturated(found, par, mag)
+    return ~are_saturated(found, par, mag)
+
+
+def calibrated(mag: np.ndarray, par: np.ndarray) -> np.ndarray:
+    """Samples (m, 3) tesla less what is known of the magnetometer. par: of kernel_parameters."""
+    sensor = par["sensor"][0]
+    return np.ascontiguousarray((mag - sensor["mag_offset"])
+                                @ np.reshape(sensor["mag_matrix"], (3, 3)).T)
+
+
+def fields_of(stamps: np.ndarray, mag: np.ndarray,
+              par: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of a magnetometer's samples (m,), (m, 3) tesla those that measure a field, calibrated."""
+    usable = np.array([is_mag_sample(each) for each in mag], dtype=bool)
+    usable[usable] = within_range(mag[usable], par)
+    return stamps[usable], calibrated(mag[usable], par)
+
+
 def usable_mags(mag: np.ndarray, par: np.ndarray) -> np.ndarray:
     """Mask (m,) of the samples of the first interval that measure the field.
 
@@ -86,9 +113,7 @@ def usable_mags(mag: np.ndarray, par: np.ndarray) -> np.ndarray:
     """
     if len(mag) == 0:
         return np.zeros(0, dtype=bool)
-    found = new_limit(par)
-    for _ in range(2):
-        usable = ~are_saturated(found, par, mag)
+    usable = within_range(mag, par)
     norm = np.linalg.norm(mag, axis=1)
     if usable.any():
         median = np.median(norm[usable])

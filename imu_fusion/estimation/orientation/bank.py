@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from imu_fusion.estimation.orientation import error_state as es
-from imu_fusion.estimation.orientation import fusion
+from imu_fusion.estimation.orientation import fusion, hard_iron
 from imu_fusion.estimation.orientation.rows import FLAG_NO_HEADING, ORIENTATION_DTYPE
 from imu_fusion.geometry.rotation import (
     quat_conjugate,
@@ -52,7 +52,9 @@ def step(state, par, stamp, sample, row):
     else:
         part(state, par)
     if used == 1:
-        return fusion.step(state[0], par[0], stamp, sample, row, _NO_TAPE)
+        result = fusion.step(state[0], par[0], stamp, sample, row, _NO_TAPE)
+        _look_for_iron(state, par, used)
+        return result
     rows = np.empty(used, ORIENTATION_DTYPE)
     result = 0
     for k in range(used):
@@ -60,7 +62,20 @@ def step(state, par, stamp, sample, row):
     if result > 0:
         weight = weights(state, par)
         mix(rows, weight, doubts(state, par, weight), row)
+    _look_for_iron(state, par, used)
     return result
+
+
+@njit
+def _look_for_iron(state, par, used):
+    """Where the magnetometer has shown hard iron, the heading is unsure under all hypotheses."""
+    s = state[0]
+    if s.iron_shown:
+        s.iron_shown = False
+        if hard_iron.judge(s.hard_iron, par[0].fusion.mag_offset_sd):
+            hard_iron.doubt_heading(s.hard_iron, s.field_norm * math.hypot(s.field[0], s.field[1]))
+            for k in range(1, used):
+                state[k].hard_iron = s.hard_iron
 
 
 @njit

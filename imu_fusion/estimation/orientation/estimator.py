@@ -13,14 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.orientation import bank, kernel, wander
-from imu_fusion.estimation.orientation.alignment import Alignment, align, usable_mags
+from imu_fusion.estimation.orientation import bank, hard_iron, kernel, remarks
+from imu_fusion.estimation.orientation.alignment import (
+    Alignment,
+    align,
+    calibrated,
+    fields_of,
+    usable_mags,
+)
 from imu_fusion.estimation.orientation.error_state import TAPE
 from imu_fusion.estimation.orientation.fixed_interval import smooth
 from imu_fusion.estimation.orientation.fixed_lag import FixedLag
 from imu_fusion.estimation.orientation.gyro_limit import limits_of
 from imu_fusion.estimation.orientation.imu_rejection import are_imu_samples, is_imu_sample
-from imu_fusion.estimation.orientation.lost_turn import widen_after_gaps
+from imu_fusion.estimation.orientation.lost_turn import is_blind, widen_lost
 from imu_fusion.estimation.orientation.mag_rejection import is_mag_sample
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_GAP, ORIENTATION_DTYPE
@@ -226,7 +232,10 @@ class OrientationEstimator:
         corrected = self.take_corrected()
         self._counted = self._counts(best)
         self._counted["gaps"] += 1
+        iron = self._state["hard_iron"][0].copy()
         self._forget()
+        self._state["hard_iron"] = iron    # which the sensor carries on
+        self._state["hard_iron"]["count"] = 0
         self._state["waiting_flags"] |= FLAG_GAP
         if self._lag is not None:
             self._lag.keep(corrected)
@@ -298,20 +307,8 @@ class OrientationEstimator:
     def remarks(self) -> list[str]:
         """What makes the estimates so far doubtful, and what to do about it."""
         best = self._likeliest()
-        realigned = int(self._counts(best)["realigned"][0])
-        found = []
-        if realigned:
-            found.append(
-                f"{realigned} time{'s' * (realigned != 1)} rates and forces stood still where the "
-                "estimate took its gyroscope to turn: bias and attitude were wrong by more than "
-                "they were stated to be, and begin anew there; begin at rest, calibrate the "
-                "gyroscope (imu_fusion calibrate gyroscope) or raise sensor.gyro_bias_sd")
-        if self._state[best]["wander"]["overall"][wander.TILT] > wander.LOST:
-            found.append(
-                "field, forces and rates contradict each other by far more than their stated "
-                "errors allow: the heading may be any; begin at rest, or calibrate the "
-                "magnetometer (imu_fusion calibrate magnetometer)")
-        return found
+        blind = self._alignment is not None and is_blind(self.params, self._alignment.at_rest)
+        return remarks.remarks(self._state[best], int(self._counts(best)["realigned"][0]), blind)
 
     def _likeliest(self):
         return bank.likeliest(bank.weights(self._state, self._par))
@@ -371,13 +368,20 @@ class OrientationEstimator:
         first = good & (imu.stamp <= end)
         first_mag = mag_stamps <= end
         first_mag[first_mag] = [is_mag_sample(mag) for mag in mags[first_mag]]
-        self._align(imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag])
-        self._know_limits(limits_of(samples[good, :3], self._par))
+        limits = limits_of(samples[good, :3], self._par)
+        begun = imu.stamp[first], samples[first], mag_stamps[first_mag], mags[first_mag]
+        at_rest = self._align(*begun)
+        if hard_iron.search(
+                self._state["hard_iron"], imu.stamp[good], samples[good, :3], limits["limit"][0],
+                self._state["gyro_bias"][0], *fields_of(mag_stamps, mags, self._par), self.params):
+            # What the whole recording shows is taken off from its first sample on.
+            self._align(*begun)
+        self._know_limits(limits)
         rows = np.zeros(len(imu), ORIENTATION_DTYPE)
         after = mag_stamps >= origin
         written = smooth(self._state, self._par, imu.stamp, samples, mag_stamps[after],
                          mags[after], rows)
-        widen_after_gaps(rows[:written], self.params)
+        widen_lost(rows[:written], self.params, at_rest)
         return rows[:written]
 
     def _know_limits(self, found):
@@ -399,21 +403,22 @@ class OrientationEstimator:
         return self._run_kernel(stamps, samples, mag_stamps[after], mag[after])
 
     def _align(self, stamps, samples, mag_stamps, mag):
-        par, sensor = self._par, self.params.sensor
+        par = self._par
         usable = usable_mags(mag, par)
         usable &= mag_stamps >= stamps[0]    # how the sensor turned before, nobody knows
         mag_stamps, mag = mag_stamps[usable], mag[usable]
-        calibrated = (mag - sensor.mag_offset) @ np.reshape(sensor.mag_matrix, (3, 3)).T
-        self._alignment = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, calibrated,
+        field = calibrated(mag, par) - self._state["hard_iron"]["offset"][0]
+        self._alignment = align(stamps, samples[:, :3], samples[:, 3:], mag_stamps, field,
                                 self.params, limits_of(samples[:, :3], par)["limit"][0])
         if not self._alignment.has_heading and self._yaw:
             turn = self._yaw - quat_to_rpy(self._alignment.quat_world_imu)[2]
             self._alignment = replace(self._alignment, quat_world_imu=np.array(
                 quat_multiply(quat_exp((0.0, 0.0, turn)), self._alignment.quat_world_imu)))
-        if sensor.mag_delay is not None:
-            self._state["mag_lag"] = sensor.mag_delay - par["gyro_delay"]
+        if self.params.sensor.mag_delay is not None:
+            self._state["mag_lag"] = self.params.sensor.mag_delay - par["gyro_delay"]
         kernel.initialise(self._state, par, self._alignment)
         self._state["align_until"] = stamps[-1]
+        return self._alignment.at_rest
 
     def _run_kernel(self, stamps, samples, mag_stamps, mags):
         if self._lag is None:

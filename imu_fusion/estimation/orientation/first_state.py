@@ -37,6 +37,9 @@ def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None
     sd[es.MAG_LAG] = p["mag_delay_sd"]
     sd[es.MAG_MATRIX:es.CLIPPED_RATE] = p["fusion"]["mag_matrix_sd"]
     s["cov"] = np.diag(sd ** 2)
+    iron = s["hard_iron"]
+    iron["taken_off"], iron["heading_var"] = iron["offset"], 0.0
+    s["cov"][es.MAG_OFFSET:es.ACC_BIAS, es.MAG_OFFSET:es.ACC_BIAS] += iron["cov"]
     if a.field_world is not None:
         follow = 1.0 if p["follows_field"] or not a.at_rest else 0.0
         _start_field(state, par, a.field_world, a.has_heading, follow)

@@ -20,6 +20,7 @@ from imu_fusion.estimation.orientation import (
     clipped_rate,
     forgetting,
     gyro_limit,
+    hard_iron,
     imu_rejection,
     mag_queue,
     output,
@@ -176,6 +177,16 @@ def _take_mags(s, p):
     if count == 0:
         return
     step.mag_count = count
+    if s.clipped or s.step.dt > p.gap.max:
+        hard_iron.interrupt(s.hard_iron)
+    for n in range(count):
+        sample = taken[n]
+        if not s.clipped:
+            then = quat_multiply(s.history.quat, sample.turn)
+            if hard_iron.add(s.hard_iron, s.stamp, then, sample.field):
+                s.iron_shown = True
+        for i in range(3):
+            sample.field[i] -= s.hard_iron.taken_off[i]
     magnetometer.collect(s, p, taken, count)
     if step.reliability < _DISTURBED:
         step.flags |= FLAG_MAG_DISTURBED

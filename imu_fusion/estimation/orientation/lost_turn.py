@@ -1,8 +1,9 @@
-"""The turn about the field, which a long gap in the samples of a tumbling body takes away.
+"""What is lost of the orientation where forces say nothing of the vertical.
 
-Linear errors do not describe a body that may have turned by more than a radian: what a filter then
-states of the turn about the field shrinks, though nothing tells it. Where the accelerometer is not
-used, that turn stays unknown.
+Linear errors do not describe a body that may have turned by more than a radian in a gap: what a
+filter then states of the turn about the field shrinks, though nothing tells it. Where the
+accelerometer is not used, that turn stays unknown. So does all of the attitude where such a
+recording begins in motion, or goes on in motion after a gap in which everything starts anew.
 """
 
 import numpy as np
@@ -19,6 +20,19 @@ def unseen_turn(params: OrientationParams, gap: float) -> float:
     """rad by which the body may have turned in ``gap`` s without samples; 0 in shorter ones than
     gap.max, and in those after which all starts anew."""
     return params.gap.rate_sd * gap if params.gap.max < gap <= params.gap.restart else 0.0
+
+
+def is_blind(params: OrientationParams, at_rest: bool) -> bool:
+    """Whether a start tells no attitude: in motion, where forces are not to be used."""
+    return params.method == "fusion" and not params.fusion.use_acc and not at_rest
+
+
+def widen_lost(rows: np.ndarray, params: OrientationParams, at_rest: bool) -> None:
+    """State in rows (n,) ORIENTATION_DTYPE, in place, what is lost; at_rest: whether they begin so.
+    """
+    if is_blind(params, at_rest):
+        rows["cov_attitude"] += UNIFORM_VARIANCE * np.eye(3)
+    widen_after_gaps(rows, params)
 
 
 def widen_after_gaps(rows: np.ndarray, params: OrientationParams) -> None:

@@ -51,7 +51,7 @@ def write(s, p, row, taped):
         row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
     wander.widen(cov_world, wander.shown(s.wander), s.wander.overall)
-    cov_world[2, 2] += s.heading_var
+    cov_world[2, 2] += min(s.heading_var + s.hard_iron.heading_var, es.UNIFORM_VARIANCE)
     if not taped:    # else the smoother does it, after its correction
         raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)
     write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)

@@ -9,6 +9,7 @@ ns; ``raw`` is as the sensor reports it.
 import numpy as np
 
 from imu_fusion.estimation.orientation.error_state import PREDICTION, ROW, N
+from imu_fusion.estimation.orientation.hard_iron import HARD_IRON
 from imu_fusion.sensors.saturation import FLAT_TOPS
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
@@ -137,6 +138,8 @@ STATE = np.dtype([
     ("force_last", "f8", 3),             # raw, likewise
     ("history", ROTATION_HISTORY),
     ("queue", MAG_QUEUE),
+    ("hard_iron", HARD_IRON),            # of a magnetometer that nobody has calibrated
+    ("iron_shown", "?"),                 # a window of it ended with the newest Imu sample
     ("mag_limit", FLAT_TOPS),            # the search for the magnetometer's range (mag_rejection)
     ("gyro_limit", FLAT_TOPS),           # and the gyroscope's (gyro_limit)
     ("gyro_spike", SPIKE),

@@ -10,7 +10,7 @@ from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.gnss_step import GnssStep
 from imu_fusion.estimation.smoother.imu_input import first_place, prepare_imu, reference_frame
 from imu_fusion.estimation.smoother.initial import first_attitudes
-from imu_fusion.estimation.smoother.iterated import Solution, solve
+from imu_fusion.estimation.smoother.iterated import SOFTNESS, Solution, solve
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
 from imu_fusion.estimation.smoother.jump_result import jump_result
 from imu_fusion.estimation.smoother.measurements.registry import (
@@ -39,6 +39,7 @@ from imu_fusion.surfaces.hill import Hill
 
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
+_MOVES = 3.0         # standard deviations of a speed that is no rest
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
@@ -53,22 +54,26 @@ class Given(NamedTuple):
     initial_quat: np.ndarray | None
     felt: bool = True
 
-    def earlier(self, lag: float) -> "Given":
-        """With stamps of the receiver that are earlier by a lag (s)."""
-        late, fix, velocity = np.int64(round(lag * 1e9)), self.fix, self.velocity
+    def earlier(self, of_fixes: float, of_velocities: float) -> "Given":
+        """With stamps of fixes and of velocities that are earlier by their lags (s)."""
+        fix, velocity = self.fix, self.velocity
         return self._replace(
-            fix=None if fix is None else replace(fix, stamp=fix.stamp - late),
-            velocity=None if velocity is None else replace(velocity, stamp=velocity.stamp - late))
+            fix=None if fix is None else replace(
+                fix, stamp=fix.stamp - np.int64(round(of_fixes * 1e9))),
+            velocity=None if velocity is None else replace(
+                velocity, stamp=velocity.stamp - np.int64(round(of_velocities * 1e9))))
 
 
 class Model(NamedTuple):
     """What is taken to be true of a recording: ``params``; ``step_at``, stamp (ns) of the first
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
-    standard deviations."""
+    standard deviations; ``repeats``: whether readings of the receiver that are the one before
+    exactly are measurements."""
 
     params: SmootherParams
     step_at: int | None = None
     noise: Mapping[str, float] = {}
+    repeats: bool = True
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -121,6 +126,8 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
         best = _likeliest(best, hill, frame)
     if best.result.failure:
         raise EstimationError(best.result.failure)
+    if not model.repeats:
+        best = best._replace(result=replace(best.result, repeats=_repeats(given, best.result)))
     if model.step_at is not None:
         offset, sd = (values[0] for values in best.result.states["gnss_step"])
         return best._replace(result=replace(best.result,
@@ -130,15 +137,46 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
 
 def _readings(given, model, frame):
     """Readings of records.READING, under the model."""
-    logs: dict[str, Log | None] = {"velocity": given.velocity, "mag": given.mag}
-    if given.fix is not None and given.fix.usable.any():
-        fix = given.fix[given.fix.usable]
+    fix, velocity = given.fix, given.velocity
+    if not model.repeats:
+        fix = None if fix is None else fix[is_news(fix)]
+        velocity = None if velocity is None else velocity[is_news(velocity)]
+    logs: dict[str, Log | None] = {"velocity": velocity, "mag": given.mag}
+    if fix is not None and fix.usable.any():
+        fix = fix[fix.usable]
         moved = fix.stamp >= (np.inf if model.step_at is None else model.step_at)
         logs |= {"fix": fix[~moved], "moved_fix": fix[moved]} if moved.any() else {"fix": fix}
     readings = prepare_readings(logs, frame, model.params)
     for name, factor in model.noise.items():
         readings["whiten"][readings["kind"] == KINDS[name]] /= factor
     return readings
+
+
+def _repeats(given, result):
+    """Name -> number of readings that are the one before exactly, while the body moves."""
+    found = {}
+    for name, log in (("fix", given.fix), ("velocity", given.velocity)):
+        if log is None:
+            continue
+        at = np.searchsorted(result.samples["stamp"], log.stamp[~is_news(log)])
+        samples = result.samples[at[at < len(result.samples)]]
+        speed = np.sum(samples["vel_world"] ** 2, axis=1) / np.trace(
+            samples["cov_velocity"], axis1=1, axis2=2)
+        if len(speed) and np.median(speed) > _MOVES ** 2:
+            found[name] = len(speed)
+    return found
+
+
+def is_news(log: FixLog | VelocityLog) -> np.ndarray:
+    """Mask (n,) of readings that are not the one before exactly; a velocity of zero may be."""
+    if isinstance(log, FixLog):
+        values = np.column_stack([log.latitude_deg, log.longitude_deg, log.height])
+    else:
+        values = log.vel_world
+    same = np.all(values[1:] == values[:-1], axis=1)
+    if isinstance(log, VelocityLog):
+        same &= values[1:].any(axis=1)
+    return np.append(True, ~same)[:len(log)]
 
 
 def _likeliest(first, hill, frame):
@@ -163,9 +201,16 @@ def _from_attitude(problem, frame, hill, quat, events):
         return events if hill is None else refine_jump(hill, _positions(problem), problem.imu.log,
                                                        events)
 
-    own = problem.from_attitude(quat)
-    solution = solve(own, events if hill is not None else None, refine)
-    return Attempt(own, _result(own, frame, hill, solution)) if np.isfinite(own.x).all() else None
+    solved = []
+    for softness in SOFTNESS if problem.on_rough_surface else SOFTNESS[:1]:
+        own = problem.from_attitude(quat)
+        solution = solve(own, events if hill is not None else None, refine, softness)
+        if np.isfinite(own.x).all():
+            solved.append((own, solution))
+    if not solved:
+        return None
+    own, solution = min(solved, key=lambda one: one[0].cost[-1])
+    return Attempt(own, _result(own, frame, hill, solution))
 
 
 def _positions(problem: Problem) -> np.ndarray:
@@ -211,5 +256,6 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
                           residuals=residuals, wander=wander, near_ground=near, failure=failure,
+                          lost_turns=tuple(problem.lost_turns),
                           log_likelihood=log_density(problem.readings)
                           - solution.last.surprise)

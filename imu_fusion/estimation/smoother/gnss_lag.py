@@ -2,16 +2,18 @@
 
 GPS time taken for UTC is 18 s ahead, a logger that stamps on arrival is late by a second. A state
 of the delay finds what is within its prior; this finds the rest: turns and changes of velocity as
-the receiver tells them are compared with those that the Imu felt at shifted times.
+fixes and velocities tell them are compared with those that the Imu felt at shifted times.
 """
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
-from imu_fusion.samples.logs import VelocityLog
+from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.samples.logs import FixLog, VelocityLog
 
 _LARGEST = 30.0       # s, on either side
 _GRID = 0.1           # s
+_PARABOLA = 21        # points of the grid, of which a velocity is told from fixes
 _SPAN = 10            # steps of the grid, over which changes are compared
 _FEWEST = 20          # changes
 _GAP = 3.0            # periods of the receiver, or the span, after which it says nothing between
@@ -22,16 +24,70 @@ _BETTER = 0.5         # of the unexplained squares at no shift, that the best ma
 _APART = 0.5          # s: what is nearer is for the state of the delay (receivers: 0.1 to 0.3)
 
 
-def find_lag(samples: np.ndarray, velocity: VelocityLog | None) -> float:
-    """Seconds by which the stamps of velocities are late, 0 where no other shift fits far better.
+def find_lags(samples: np.ndarray, frame: LocalFrame, fix: FixLog | None,
+              velocity: VelocityLog | None) -> tuple[float, float]:
+    """Seconds by which the stamps of fixes and of velocities are late, 0 where no other shift fits
+    far better. What tells none has that of the other.
 
     Args:
         samples: of a SmootherResult: attitudes, rates and forces at the stamps of the Imu. A wrong
             lag tilts the attitudes until the forces fit; turns about the vertical hardly feel it.
-        velocity: VelocityLog or None, from which no lag is told.
+        frame: of the result. fix: FixLog or None. velocity: VelocityLog or None.
     """
+    told = None
+    if fix is not None and fix.usable.any():
+        fix = fix[fix.usable]
+        told = _slopes(fix.stamp, frame.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height))
+    later = np.nan_to_num(_later(velocity, told))
+    of_velocities = _lag(samples, velocity)
+    if np.isnan(of_velocities):
+        of_velocities = np.nan_to_num(_lag(samples, told)) + later
+    of_fixes = of_velocities - later
+    # Forces tell lags to some tenths of a second, fixes and velocities those between them better.
+    if later and abs(of_fixes) <= _APART:
+        return 0.0, float(later)
+    if later and abs(of_velocities) <= _APART:
+        return -float(later), 0.0
+    return float(of_fixes), float(of_velocities)
+
+
+def _slopes(stamp, place):
+    """VelocityLog of the slopes of parabolas through places (n, 3) m at stamps (n,) ns, about each
+    point of a grid; None of too few."""
+    at = (stamp - stamp[0]) * 1e-9
+    if len(stamp) < _FEWEST or np.any(np.diff(at) <= 0.0) or at[-1] < 2 * _PARABOLA * _GRID:
+        return None
+    grid = np.arange(0.0, at[-1], _GRID)
+    slope = scipy.signal.savgol_filter(
+        np.column_stack([np.interp(grid, at, c) for c in place.T]), _PARABOLA, 2, deriv=1,
+        delta=_GRID, axis=0)
+    step = np.diff(at)[np.clip(np.searchsorted(at, grid, side="right") - 1, 0, len(at) - 2)]
+    known = step <= max(_GAP * np.median(np.diff(at)), _SPAN * _GRID)
+    return VelocityLog(stamp[0] + np.round(1e9 * grid[known]).astype(np.int64), slope[known],
+                       np.zeros((int(known.sum()), 3, 3)))
+
+
+def _later(velocity, of_fixes):
+    """Seconds by which velocities are later than those that fixes tell; NaN where it is not told.
+    """
+    if velocity is None or of_fixes is None or len(velocity) < 3:
+        return np.nan
+    steps = np.diff(velocity.stamp)[:, None] * 1e-9
+    place = np.vstack([np.zeros(3), np.cumsum(
+        0.5 * (velocity.vel_world[1:] + velocity.vel_world[:-1]) * steps, axis=0)])
+    velocity = _slopes(velocity.stamp, place)
+    if velocity is None:
+        return np.nan
+    start = of_fixes.stamp[0]
+    at, told_at = ((log.stamp - start) * 1e-9 for log in (velocity, of_fixes))
+    grid = np.arange(min(at[0], told_at[0]), max(at[-1], told_at[-1]) + _GRID, _GRID)
+    return _best(_told(grid, told_at, of_fixes.vel_world), _told(grid, at, velocity.vel_world))[1]
+
+
+def _lag(samples, velocity):
+    """That of velocities; NaN where they tell none."""
     if velocity is None or len(velocity) < 3:
-        return 0.0
+        return np.nan
     t = (samples["stamp"] - samples["stamp"][0]) * 1e-9
     at = (velocity.stamp - samples["stamp"][0]) * 1e-9
     turn = scipy.spatial.transform.Rotation.from_quat(samples["quat_world_imu"])
@@ -71,7 +127,7 @@ def _told(grid, at, values):
 
 def _best(felt, told):
     """Correlation and lag (s) of the shift at which what was told (n, k) fits what was felt; the
-    lag is 0 unless it fits well there, and far worse without."""
+    lag is NaN unless it fits well there, and far worse without."""
     most = min(round(_LARGEST / _GRID), len(felt) // 2)
     fits = {}
     for lag in range(-most, most + 1):
@@ -79,9 +135,11 @@ def _best(felt, told):
         a, b = (felt[:len(felt) - lag], told[lag:]) if lag >= 0 else (felt[-lag:], told[:lag])
         fits[lag] = _compare(a, b, 0.3 * np.isfinite(told[:, 0]).sum())
     best = max(fits, key=lambda lag: fits[lag][0])
-    certain = (abs(best) * _GRID > _APART and fits[best][0] > _CORRELATION
-               and fits[best][1] < _BETTER * fits[0][1])
-    return fits[best][0], best * _GRID if certain else 0.0
+    if fits[best][0] <= _CORRELATION:
+        return fits[best][0], np.nan
+    if abs(best) * _GRID <= _APART:
+        return fits[best][0], 0.0
+    return fits[best][0], best * _GRID if fits[best][1] < _BETTER * fits[0][1] else np.nan
 
 
 def _compare(felt, told, fewest):

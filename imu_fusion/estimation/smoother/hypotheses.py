@@ -59,6 +59,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         return found.result
     if model.params.maximum_likelihood != "off":
         found, model = _bent_field(found, model, smooth)
+    found, model = _repeated(found, model, smooth)
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
     scatter = max(1.0, found.result.misfit().get("fix", 1.0))
     for other in _steps(found.result, model, scatter):
@@ -68,7 +69,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
             break
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
-            or any(is_many(outliers) for outliers in found.result.outliers().values())):
+            or _many_outliers(found.result)):
         return _adapted(found, model, given)
     for alternatives in (_delays, _velocity_delays, _wandering_fixes, _wandering_velocities,
                          _walks):
@@ -78,6 +79,9 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     for name in (_DELAY, _VELOCITY_DELAY):
         if model.params.get(name) != given[name]:
             found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
+    # Or like a step.
+    if model.step_at is not None:
+        found, model = _try(found, model, model._replace(step_at=None), smooth, -_GAIN)
     found, model = _try(found, model, fit_noise(found.problem, model), smooth)
     if model.params.gnss.position_error_sd != tuple(given["gnss.position_error_sd"]):
         found, model = _no_surer_than_stated(found, model, given, smooth)
@@ -108,6 +112,27 @@ def _deep_landing(found, model, smooth):
     better = is_doubtful(found.result) or (lands and tried.result.surface["landing"].first_excess
                                            < fit.first_excess)
     return (tried, other) if lands and better else (found, model)
+
+
+def _repeated(found, model, smooth):
+    """Without readings that are the one before exactly, of a receiver that holds its last while the
+    body moves, if the others fit then, or far better; not compared by likelihood, as these rows are
+    left out."""
+    if fits(found.result) and not _many_outliers(found.result):
+        return found, model
+    other = model._replace(repeats=False)
+    try:
+        tried = smooth(other)
+    except EstimationError:
+        return found, model
+    if not tried.result.repeats or _many_outliers(tried.result):
+        return found, model
+    better = fits(tried.result) or _left(tried.result) <= max(1.0, _LEFT * _left(found.result))
+    return (tried, other) if better else (found, model)
+
+
+def _many_outliers(result):
+    return any(is_many(outliers) for outliers in result.outliers().values())
 
 
 def _bent_field(found, model, smooth):
@@ -143,7 +168,9 @@ def _field_wanders(found):
 
 
 def _delays(found, model):
-    return _where_zero(model, {_DELAY: 0.2})
+    # Velocities would have told more than that, see gnss_lag.
+    for sd in (0.2,) if "velocity" in found.result.innovations else (0.2, 2.0):
+        yield from _where_zero(model, {_DELAY: sd})
 
 
 def _velocity_delays(found, model):

@@ -10,16 +10,21 @@ forward and the Bryson-Frazier pass back (:mod:`.linear_solve`); between samples
 may gape (multiple shooting), and the step closes the gaps.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.problem import Change, Problem
+from imu_fusion.estimation.smoother.surface_follower import follow_surface
 
 _HELD_SD = 1e-6               # s, of a delay that is not estimated yet
 _SETTLED = 0.01               # relative change of the cost with which delays are let go
+#: Times the sigma of a rough surface by which it counts before its own: ways to begin, of which the
+#: one is taken that ends with the least cost.
+SOFTNESS: tuple[tuple[float, ...], ...] = ((), (3.0,), (10.0, 3.0))
+_SOFT_STEPS = 8
 _CYCLE = 0.1                  # of a step's change of the cost: two steps that end so near cycle
 _NEAR = 3.0                   # tolerances: after such a step the next is likely the last
 
@@ -70,8 +75,23 @@ class _Delays:
             self._binding = self._binding and back > _CYCLE * change
 
 
+def _settle_softly(problem, events, softness):
+    """Let a trajectory settle on a rough surface that counts little at first: held firmly it stays
+    on the undulation on which it begins."""
+    for factor in softness:
+        problem.softness = factor
+        first = len(problem.cost)
+        for _ in range(_SOFT_STEPS):
+            problem.step(events)
+            cost = problem.cost[first:]
+            if len(cost) > 1 and abs(cost[-1] - cost[-2]) <= _SETTLED * cost[-1]:
+                break
+    problem.softness = 1.0
+
+
 def solve(problem: Problem, events: JumpEvents | None,
-          refine: Callable[[Problem, JumpEvents], JumpEvents]) -> Solution:
+          refine: Callable[[Problem, JumpEvents], JumpEvents],
+          softness: Sequence[float] = ()) -> Solution:
     """Iterate to convergence; the last step, or one more, computes covariances.
 
     Args:
@@ -79,11 +99,16 @@ def solve(problem: Problem, events: JumpEvents | None,
         events: first JumpEvents or None.
         refine: called with the problem and events after the first convergence; returns better
             events.
+        softness: one of :data:`SOFTNESS`.
     """
     stop = problem.params.iteration
     delays = _Delays(problem)
-    problem.follow()
-    refined, converged, steps, first = events is None, False, 0, 0
+    if problem.rates_recovered and events is None:
+        follow_surface(problem)
+    else:
+        problem.follow()
+    _settle_softly(problem, events, softness)
+    refined, converged, steps, first = events is None, False, 0, len(problem.cost)
     last = Change(np.full(3, np.inf))
     near = False
     while steps < stop.max:

@@ -19,6 +19,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
     MEASUREMENTS,
 )
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
+    Spread,
     evaluate_constraints,
     in_free_fall,
     put_lever_derivatives,
@@ -131,12 +132,27 @@ class Problem:
         self.x = np.zeros((len(self.imu.log), self.size + 1))
         self.cost: list[float] = []
         self._process = 0.0   # squared noise of the trajectory that the last step left
+        self.spread = Spread(None) if self.on_rough_surface else None
+        self.softness = 1.0
+        self.lost_turns: list[int] = []   # stamps at which one of several turns was taken
 
     @property
     def recording(self) -> Recording:
         """For the kernels."""
         return Recording(self.model, self.intervals, self.readings, self.reading_start,
                          self.contacts, self.contact_start)
+
+    @property
+    def on_rough_surface(self) -> bool:
+        """Whether a surface may bend within what the position is unsure by."""
+        return any(constraint.rough for constraint in self.constraints)
+
+    @property
+    def rates_recovered(self) -> bool:
+        """Whether there are a surface that holds always, and rates some of which were not
+        measured, but recovered."""
+        return (self.imu.log.gyr_sd is not None and len(self.constraints) > 0
+                and all(constraint.phase == "always" for constraint in self.constraints))
 
     def attach(self, bind: bool = True) -> None:
         """Place the readings in time, for the delays of their stamps found so far; with
@@ -251,16 +267,21 @@ class Problem:
         i = self.blocks.surface_lever_arm
         return self.params.surface.lever_arm if i < 0 else slow_states(self.x, i, 3)
 
-    def surface_points(self) -> np.ndarray:
-        """Points (N, 3) m of the trajectory that are held on the surface."""
-        return surface_points(self.x[:, POS:POS + 3], self.x[:, ATT:ATT + 4],
-                              self._surface_lever())
+    def surface_points(self, part: slice = slice(None)) -> np.ndarray:
+        """Points (N, 3) m of (a part of) the trajectory that are held on the surface."""
+        x = self.x[part]
+        lever = np.broadcast_to(self._surface_lever(), (len(self.x), 3))[part]
+        return surface_points(x[:, POS:POS + 3], x[:, ATT:ATT + 4], lever)
 
-    def _touch(self, events: JumpEvents | None) -> None:
-        """Evaluate the surface at the trajectory."""
+    def touch(self, events: JumpEvents | None, part: slice = slice(None),
+               spread: Spread | None = None) -> None:
+        """Evaluate the surface at a part of the trajectory."""
+        elsewhere, points = np.ones(len(self.x), bool), np.zeros((len(self.x), 3))
+        elsewhere[part], points[part] = False, self.surface_points(part)
         self.contact_start, self.contacts = evaluate_constraints(
-            self.constraints, self.surface_points(), self.imu.log.stamp, events, self.params,
-            self.free)
+            self.constraints, points, self.imu.log.stamp, events, self.params,
+            self.free | elsewhere, self.spread if spread is None else spread)
+        self.contacts["sigma"] *= self.softness
         lever = self._surface_lever()
         if self.blocks.surface_lever_arm >= 0 or np.any(lever):
             put_lever_derivatives(self.contact_start, self.contacts, self.x[:, ATT:ATT + 4], lever)
@@ -271,8 +292,9 @@ class Problem:
     def step(self, events: JumpEvents | None, with_cov: bool = False) -> Change:
         """One Gauss-Newton step; moves x, and notes the cost of the trajectory before it."""
         n, total = self.size, len(self.x)
+        with_cov = with_cov or self.spread is not None
         if self.constraints:
-            self._touch(events)
+            self.touch(events)
         delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
         boxminus(self.mean, self.x[0], delta)
         prior_cost = float(np.sum((delta / self.prior_sd) ** 2))
@@ -291,4 +313,6 @@ class Problem:
             sampled = np.append(np.arange(0, total - 1, THINNING), total - 1)
             for column in variances.T:
                 column[:] = np.interp(np.arange(total), sampled, column[sampled])
+        if self.spread is not None:
+            self.spread = Spread(covariances[:, 0])
         return Change(largest, surprise, covariances, variances)

@@ -37,7 +37,9 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
         yield (f"the smoother did not converge in {result.iterations} iterations: take its "
                "result as provisional")
     yield from _on_missing_imu(result)
+    yield from _on_lost_turns(result)
     yield from _on_stamps(result)
+    yield from _on_repeats(result)
     yield from _on_step(result)
     yield from _on_single_pass(result)
     yield from _on_adapted(result)
@@ -57,15 +59,37 @@ def _on_missing_imu(result):
                ", and the fixes wander by what is stated of them (gnss.position_error_sd)")
 
 
+def _on_lost_turns(result):
+    if result.lost_turns:
+        when = ", ".join(f"{(stamp - int(result.samples['stamp'][0])) * 1e-9:.1f}"
+                         for stamp in result.lost_turns)
+        yield (f"the turn about the magnetic field was lost (a gap in the Imu samples, or rates "
+               f"beyond the range) {when} s after the first Imu sample: of several that fit what "
+               "follows about as well the likeliest is taken, and attitude and trajectory from "
+               "there on may be wrong by more than is stated; more fixes, or a surface known "
+               "better, tell")
+
+
 def _on_stamps(result):
-    lag = result.gnss_lag
-    if lag:
+    of_fixes, of_velocities = result.gnss_lag, result.gnss_lag + result.velocity_lag
+    lags = [("fixes and velocities", of_fixes)] if of_fixes == of_velocities else [
+        ("fixes", of_fixes), ("velocities", of_velocities)]
+    for what, lag in lags:
+        if not lag:
+            continue
         leap = ": GPS time that was not turned into UTC" if abs(
             abs(lag) - _LEAP_SECONDS) < 0.5 else ""
-        yield (f"the stamps of fixes and velocities are {abs(lag):.1f} s "
+        yield (f"the stamps of {what} are {abs(lag):.1f} s "
                f"{'late' if lag > 0 else 'early'} against those of the Imu, as turns and forces "
                f"tell{leap}; they were taken so much {'earlier' if lag > 0 else 'later'}. Correct "
                "the recording, or see that both clocks are one")
+
+
+def _on_repeats(result):
+    told = [f"{count} of the {name} readings" for name, count in result.repeats.items() if count]
+    if told:
+        yield (" and ".join(told) + " are the one before exactly, and contradict the rest: a "
+               "receiver or driver that holds its last; they are left out")
 
 
 def _on_step(result):

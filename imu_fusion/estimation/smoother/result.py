@@ -79,8 +79,10 @@ class SmootherResult:
     of the recording.
     ``cost``: of the trajectory before each step; ``iterations`` counts the steps;
     ``converged``: None where the method passes once and so cannot tell.
-    ``gnss_lag``: s, by which the receiver's stamps were found late and taken earlier.
+    ``gnss_lag``: s, by which the receiver's stamps were found late and taken earlier;
+    ``velocity_lag``: s, by which those of velocities were found later still.
     ``gnss_step``: a step of all fixes that was found, or None.
+    ``repeats``: name -> number of readings that are the one before exactly and were left out.
     ``adapted``: name of a parameter -> value that was used in its place, as the readings are far
     likelier under it; ``noise``: name of readings -> factor of their stated standard deviations,
     likewise.
@@ -91,6 +93,8 @@ class SmootherResult:
     attitudes are unknown; None: it does.
     ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
     or below it.
+    ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
+    likely: the turn about the field had been lost.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
@@ -106,12 +110,15 @@ class SmootherResult:
     surface: dict[str, SurfaceFit] = field(default_factory=dict)
     residuals: dict[str, np.ndarray] = field(default_factory=dict)
     gnss_lag: float = 0.0
+    velocity_lag: float = 0.0
     gnss_step: GnssStep | None = None
+    repeats: dict[str, int] = field(default_factory=dict)
     adapted: dict[str, float] = field(default_factory=dict)
     noise: dict[str, float] = field(default_factory=dict)
     wander: dict[str, float] = field(default_factory=dict)
     acc_density: float | None = None
     near_ground: float = 0.0
+    lost_turns: tuple[int, ...] = ()
     failure: str = ""
     log_likelihood: float = -np.inf
 

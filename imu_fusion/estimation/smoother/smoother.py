@@ -7,7 +7,7 @@ import numpy as np
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.attempt import Attempt, Given, Model, attempt
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
-from imu_fusion.estimation.smoother.gnss_lag import find_lag
+from imu_fusion.estimation.smoother.gnss_lag import find_lags
 from imu_fusion.estimation.smoother.hypotheses import likelier
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.params import SmootherParams
@@ -56,34 +56,44 @@ class Smoother:
                                                               initial_quat)
         mag = _calibrated(mag, self.params)
         given, model = Given(imu, mag, fix, velocity, events, initial_quat), Model(self.params)
-        found, lag = self._smooth_and_time(given, model)
-        if found is None or lag:
-            # What is left of a lag is for the state of the delay.
-            given = given.earlier(lag)
-            model = model.changed({"gnss.time_offset_sd": max(self.params.gnss.time_offset_sd,
-                                                              _LAG_SD)})
+        found, lags = self._smooth_and_time(given, model)
+        further = lags[1] - lags[0]
+        if found is None or any(lags):
+            # What is left of a lag is for the states of delays.
+            given = given.earlier(*lags)
+            gnss = self.params.gnss
+            model = model.changed({"gnss.time_offset_sd": max(gnss.time_offset_sd, _LAG_SD)})
+            if further:
+                model = model.changed({"gnss.velocity_time_offset_sd": max(
+                    gnss.velocity_time_offset_sd, _LAG_SD)})
             found = attempt(given, model, self.surface)
         result = likelier(found, model, lambda other: attempt(given, other, self.surface))
-        if lag:
-            delay, sd = result.states["gnss_time_offset"]
-            result = replace(result, gnss_lag=lag, states={
-                **result.states, "gnss_time_offset": (delay + lag, sd)})
+        if any(lags):
+            states = dict(result.states)
+            for name, lag in (("gnss_time_offset", lags[0]), ("velocity_time_offset", further)):
+                if name in states:
+                    states[name] = states[name][0] + lag, states[name][1]
+            result = replace(result, gnss_lag=lags[0], velocity_lag=further, states=states)
         return result
 
-    def _smooth_and_time(self, given: Given, model: Model) -> tuple[Attempt | None, float]:
-        """Smoothed with the stamps as they are (None where that cannot be), and the lag (s) of the
-        receiver that it tells."""
+    def _smooth_and_time(self, given: Given, model: Model
+                         ) -> tuple[Attempt | None, tuple[float, float]]:
+        """Smoothed with the stamps as they are (None where that cannot be), and the lags (s) of
+        fixes and velocities that it tells."""
         try:
             found = attempt(given, model, self.surface)
         except EstimationError:
             if self.surface is None or given.events is not None:
                 raise
             # With fixes of another time no jump is found, and surfaces contradict.
-            lag = find_lag(attempt(given, model, None).result.samples, given.velocity)
-            if not lag:
+            lags = self._lags(given, attempt(given, model, None))
+            if not any(lags):
                 raise
-            return None, lag
-        return found, find_lag(found.result.samples, given.velocity)
+            return None, lags
+        return found, self._lags(given, found)
+
+    def _lags(self, given: Given, found: Attempt) -> tuple[float, float]:
+        return find_lags(found.result.samples, found.result.frame, given.fix, given.velocity)
 
 
 def _calibrated(mag, params):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.errors import LayoutError
+from imu_fusion.errors import EstimationError, LayoutError
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
@@ -325,3 +325,55 @@ def test_the_papers_method_says_what_it_leaves_out(impact):
     for accelerometers, said in ((layout(), True), (exact, False)):
         estimator = AccelerationFieldEstimator(PARAMS.replace(method="ao"), accelerometers)
         assert bool(estimator.remarks()) is said
+
+
+def test_a_bias_far_beyond_its_sd_is_named(impact):
+    readings = felt(impact)
+    assert judged(impact, readings)[1] == []
+    readings[:, 1, 0] += 2.0
+    assert any("'left' fits best with biases of (1." in text and "left.bias_sd" in text
+               for text in judged(impact, readings)[1])
+
+
+@pytest.mark.parametrize("scale, turn, said", [(1.0, 0.0, None), (1.1, 0.0, "gyro_scale_sd"),
+                                               (1.0, 20.0, "gyro_axes_sd")])
+def test_a_gyroscope_whose_scale_or_axes_are_off_is_named(impact, scale, turn, said):
+    axes = Rotation.from_rotvec(np.radians(turn) * np.array([0.6, 0.8, 0.0])).as_matrix()
+    gyr = scale * impact.omega @ axes.T
+    gyr = gyr + np.random.default_rng(1).normal(0.0, 0.02, gyr.shape)
+    estimator = AccelerationFieldEstimator(PARAMS.replace(
+        **{"use_gyro": True, "sensor.gyro_noise_density": 0.02 / 1000 ** 0.5}), layout())
+    estimator.run(impact.stamp, felt(impact), gyr)
+    remarks = [text for text in estimator.remarks() if "gyroscope fits best with" in text]
+    assert bool(remarks) == bool(said)
+    assert all(said in text for text in remarks)
+    if scale != 1.0:
+        found = [float(v) for v in re.findall(r"[\d.]+", remarks[0].split("(")[1].split(")")[0])]
+        assert found == pytest.approx([10.0] * 3, abs=1.0)
+
+
+@pytest.mark.parametrize("speed, axis, use_gyro", [
+    (0.6, (1.0, 0.0, 0.0), False), (1.7, (1.0, 2.0, 3.0), False), (1.7, (0.0, 0.0, 1.0), True),
+    (0.6, (0.0, 0.0, 1.0), True), (5.0, (0.0, 0.0, 1.0), True)])
+def test_a_body_that_turns_steadily_from_the_first_sample_on_is_not_still(speed, axis, use_gyro):
+    axis = np.array(axis) / np.linalg.norm(axis)
+    t = np.arange(2000) * 1e-3
+    random = np.random.default_rng(2)
+    up = Rotation.from_rotvec(-np.outer(speed * t, axis)).apply([0.0, 0.0, 9.8])
+    omega = np.tile(speed * axis, (len(t), 1))
+    force = up[:, None] + np.cross(omega[0], np.cross(omega[0], PAPER_POSITIONS - CENTRE))
+    readings = np.einsum("kij,nkj->nki", PAPER_AXES, force) + random.normal(0.0, NOISE,
+                                                                            (len(t), 4, 3))
+    params = PARAMS.replace(initial=Initial(), use_gyro=use_gyro, **(
+        {"sensor.gyro_noise_density": 0.02 / 1000 ** 0.5} if use_gyro else {}))
+    gyr = omega + random.normal(0.0, 0.02, omega.shape) if use_gyro else None
+    with pytest.raises(EstimationError, match="never still"):
+        AccelerationFieldEstimator(params, layout()).run((t * 1e9).astype(np.int64), readings, gyr)
+
+
+def test_what_is_not_gravity_is_no_rest():
+    """A body in free fall feels nothing, however steadily."""
+    readings = np.random.default_rng(3).normal(0.0, NOISE, (1000, 4, 3))
+    with pytest.raises(EstimationError, match="not gravity"):
+        AccelerationFieldEstimator(PARAMS.replace(initial=Initial()), layout()).run(
+            np.arange(1000) * 1_000_000, readings)

@@ -63,6 +63,34 @@ def test_it_is_known_with_gravity_and_after_shorter_gaps(tumbling):
     assert unseen_turn(PARAMS, 0.5) == 2.5
 
 
+def test_a_body_that_goes_on_in_motion_without_forces_has_no_attitude(tumbling):
+    """After a gap in which all starts anew: the force of a body in motion passed for gravity, 28
+    deg stated at 120 deg of error."""
+    params = PARAMS.replace(**{"gap.restart": 0.3})
+    error, cov = run(params, tumbling)
+    after = tumbling[3] > GAP[1] - 1e-6
+    sd = np.sqrt(np.trace(cov, axis1=1, axis2=2))
+    assert np.degrees(sd[~after].max()) < 30.0
+    assert np.degrees(sd[after].min()) > 150.0 and (error[after] < 3.0 * sd[after]).all()
+    estimator = OrientationEstimator(params)
+    estimator.run(*tumbling[:2])
+    assert any("nothing shows the vertical" in text for text in estimator.remarks())
+    # At rest, or with gravity, there is something to begin with.
+    for known in (PARAMS, params.replace(**{"fusion.use_acc": True})):
+        estimator = OrientationEstimator(known)
+        estimator.run(*tumbling[:2])
+        assert not any("nothing shows" in text for text in estimator.remarks())
+
+
+def test_the_stream_says_that_all_starts_anew():
+    said = []
+    stream = OrientationStream(PARAMS, warn=said.append)
+    for start in (0, 3000, 6000):
+        stream.take({IMU_TOPIC: [imu_message(10**18 + (start + k) * 10**6, "imu", (0, 0, 0),
+                                             (0, 0, 9.8)) for k in range(0, 100, 10)]})
+    assert sum("all starts anew" in text for text in said) == 1
+
+
 def test_the_stream_says_it_once():
     said = []
     stream = OrientationStream(PARAMS, warn=said.append)

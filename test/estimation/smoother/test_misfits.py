@@ -139,7 +139,7 @@ def test_correlation_does_not_depend_on_what_is_stated():
     rng = np.random.default_rng(1)
     white = [correlation(rng.standard_normal((150, 3))) for _ in range(200)]
     assert np.count_nonzero(white) < 4    # a thousandth of 600 components
-    slow = gauss_markov((150, 3), 1.0, 10.0, 1.0, rng)
+    slow = gauss_markov(np.arange(150.0), [1.0] * 3, 10.0, rng)
     assert correlation(slow) == pytest.approx(np.exp(-0.1), abs=0.15)
     assert correlation(0.3 * slow) == pytest.approx(correlation(slow))
     assert correlation(0.01 * slow) == 0.0    # less than the mean of 150 is sure: .08
@@ -151,7 +151,8 @@ def test_errors_of_a_minute_show_in_means_over_longer_times():
     white = rng.standard_normal((600, 3))
     assert wandering(stamp, white) == 1.0
     # .3 over a minute: a twentieth in the variance of means over 5 s, half of those over 80 s.
-    assert wandering(stamp, white + 0.3 * gauss_markov((600, 3), 1.0, 60.0, 1.0, rng)) > 2.0
+    assert wandering(stamp, white + 0.3 * gauss_markov(
+        np.arange(600.0), [1.0] * 3, 60.0, rng)) > 2.0
 
 
 def walked(seconds, errors, seed):
@@ -190,3 +191,49 @@ def test_fixes_that_are_small_and_alike_are_not_averaged_away():
     assert "gnss.position_error_sd" in result.adapted
     # One error of each axis for minutes: NEES of three numbers, below 16.3 in 999 of 1000.
     assert nees(error, result.samples["cov_position"]).mean() < 16.3
+
+
+def off(result):
+    """Errors (n, 3) m of a figure of eight."""
+    t = (result.samples["stamp"] - result.samples["stamp"][0]) * 1e-9
+    truth = np.stack([100 * np.sin(0.1 * t), 50 * np.sin(0.2 * t), 0 * t], axis=1)
+    return FRAME.to_enu(*result.frame.to_geodetic(result.samples["position_world"])) - truth
+
+
+def test_a_receiver_that_holds_its_last_is_left_out_where_it_contradicts(logs):
+    imu, mag, fix, velocity = logs
+    held = np.arange(len(fix))
+    held[120:240] = 120
+    result = Smoother(PARAMS).run(
+        imu, mag, dataclasses.replace(fix[held], stamp=fix.stamp),
+        dataclasses.replace(velocity[held], stamp=velocity.stamp))
+    assert result.repeats == {"fix": 119, "velocity": 119}
+    assert any("holds its last" in text for text in result.remarks())
+    assert nees(off(result), result.samples["cov_position"]).mean() < 9.0
+
+
+def test_a_receiver_at_rest_may_repeat_itself():
+    imu, _, fix, velocity = drive(20.0, 4)
+    rng = np.random.default_rng(5)
+    still = dataclasses.replace(
+        imu, gyr=0.0175 * rng.standard_normal(imu.gyr.shape),
+        acc=[0.0, 0.0, 9.8] + 0.1 * rng.standard_normal(imu.gyr.shape))
+    result = Smoother(PARAMS).run(
+        still, None, dataclasses.replace(fix[np.zeros(len(fix), int)], stamp=fix.stamp),
+        dataclasses.replace(velocity, vel_world=0.0 * velocity.vel_world))
+    assert not result.repeats
+    assert np.ptp(result.samples["position_world"], axis=0).max() < 0.1
+
+
+@pytest.mark.parametrize(("fixes", "velocities"), [(-2.0, 0.0), (0.0, 2.0)])
+def test_fixes_and_velocities_of_two_clocks(fixes, velocities):
+    walk = walking.Walk(60.0, np.random.default_rng(8))
+    recorded = walking.record(walk, np.random.default_rng(9))
+    result = Smoother().run(recorded.imu, recorded.mag, later(recorded.fix, fixes),
+                            later(recorded.velocity, velocities))
+    assert result.gnss_lag == pytest.approx(fixes, abs=0.11)
+    assert result.velocity_lag == pytest.approx(velocities - fixes, abs=0.11)
+    samples = result.samples[500:-500]
+    place = result.frame.to_enu(*walking.FRAME.to_geodetic(walk.position(
+        (samples["stamp"] - recorded.imu.stamp[0]) * 1e-9)))
+    assert np.sqrt(np.mean((samples["position_world"] - place) ** 2)) < 0.03

@@ -108,6 +108,9 @@ def judge_anchor(s, p):
     one_pose = hard * soft / (hard + soft) if hard + soft > 0.0 else 0.0
     turned = 0.0
     variance = 0.0
+    for i in range(3):    # of what was taken off, which is not the prior's
+        for j in range(3):
+            variance += s.anchor[i] * s.hard_iron.cov[i, j] * s.anchor[j]
     for a in range(_IRON):
         i = _iron_index(a)
         turned += s.anchor[a] * (s.mag_offset[a] if a < 3 else

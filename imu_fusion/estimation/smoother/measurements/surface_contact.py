@@ -5,11 +5,13 @@ linear solution: surfaces are Python (grids, splines). The kernel adds the heigh
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
+from imu_fusion.estimation.smoother.measurements.rough_surface import linearise
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import CONTACT
 from imu_fusion.estimation.smoother.state import ATT, POS, slow
@@ -17,6 +19,12 @@ from imu_fusion.kernels import njit
 from imu_fusion.samples.free_fall import force_at, free_falls
 from imu_fusion.samples.logs import ImuLog, seconds
 from imu_fusion.surfaces.constraint import Constraint
+
+
+class Spread(NamedTuple):
+    """Covariances (N, 3, 3) m^2 of positions; None: nothing is known of them yet."""
+
+    cov: np.ndarray | None
 
 
 def surface_points(position_world: np.ndarray, quat_world_imu: np.ndarray,
@@ -72,7 +80,8 @@ def holds(constraint: Constraint, stamp: np.ndarray, events: JumpEvents | None,
 
 def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.ndarray,
                          stamp: np.ndarray, events: JumpEvents | None, params: SmootherParams,
-                         free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+                         free: np.ndarray | None = None,
+                         spread: Spread | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Rows of all constraints on the samples where they hold.
 
     A row of every sample says as much per second at any rate of the Imu: the standard deviation
@@ -86,6 +95,7 @@ def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.n
         params: ``jump.event_margin`` around the events heights are free.
         free: mask (N,) of the samples :func:`in_free_fall`, at which nothing holds that holds
             always; None: none.
+        spread: of the positions; None: rough surfaces, too, are linearised where they are.
 
     Returns:
         start (N + 1,) of the rows of each sample, rows (r,) of CONTACT, without derivatives but
@@ -101,11 +111,17 @@ def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.n
                                       params.jump.event_margin, free))
         if not len(sample):
             continue
-        residual, gradient = constraint.evaluate(position_world[sample])
+        bend = np.zeros(len(sample))
+        if constraint.rough and spread is not None:
+            residual, gradient, bend = linearise(
+                constraint.evaluate, position_world[sample],
+                None if spread.cov is None else spread.cov[sample])
+        else:
+            residual, gradient = constraint.evaluate(position_world[sample])
         keep = np.isfinite(residual)
         rows = np.zeros(keep.sum(), CONTACT)
         rows["residual"], rows["position"] = residual[keep], gradient[keep]
-        rows["sigma"] = constraint.sigma * share[sample[keep]]
+        rows["sigma"] = np.sqrt(constraint.sigma ** 2 + bend[keep]) * share[sample[keep]]
         rows["height"] = constraint.height
         samples.append(sample[keep])
         pieces.append(rows)
