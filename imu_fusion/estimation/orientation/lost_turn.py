@@ -28,8 +28,7 @@ def is_blind(params: OrientationParams, at_rest: bool) -> bool:
 
 
 def widen_lost(rows: np.ndarray, params: OrientationParams, at_rest: bool) -> None:
-    """State in rows (n,) ORIENTATION_DTYPE, in place, what is lost; at_rest: whether they begin so.
-    """
+    """State in rows (n,) ORIENTATION_DTYPE, in place, what is lost; at_rest: they begin so."""
     if is_blind(params, at_rest):
         rows["cov_attitude"] += UNIFORM_VARIANCE * np.eye(3)
     widen_after_gaps(rows, params)

@@ -68,8 +68,7 @@ def _slopes(stamp, place):
 
 
 def _later(velocity, of_fixes):
-    """Seconds by which velocities are later than those that fixes tell; NaN where it is not told.
-    """
+    """Seconds by which velocities are later than those that fixes tell; NaN: it is not told."""
     if velocity is None or of_fixes is None or len(velocity) < 3:
         return np.nan
     steps = np.diff(velocity.stamp)[:, None] * 1e-9
