@@ -25,8 +25,9 @@ def check_standing(imu: ImuLog, name: str) -> list[Finding]:
         stands = [(axis, found) for axis in range(3)
                   if (found := _longest_stand(values[:, axis])) is not None]
         stands = [(axis, part) for axis, part in stands
-                  if (_turned(acc[part]) > _TURNED if values is gyr else
-                      _moved(np.delete(acc[part], axis, axis=1)) > _MOVED)]
+                  if (_turned(acc[part], _changing(gyr[part])) > _TURNED if values is gyr else
+                      set(_changing(gyr[part])) - {axis}
+                      and _moved(np.delete(acc[part], axis, axis=1)) > _MOVED)]
         if stands:
             part = stands[0][1]
             axes = ", ".join("xyz"[axis] for axis, _ in stands)
@@ -55,10 +56,19 @@ def _longest_stand(column):
     return slice(first, first + length)
 
 
-def _turned(acc):
-    """By how much (rad) directions turn, of means over tenths of (n, 3)."""
+def _changing(values):
+    """Axes of (n, 3) that do not stand still. A body that is simulated without noise may turn about
+    one alone: then the rates about the others, and its part of gravity, rightly stand."""
+    return np.flatnonzero(np.ptp(values, axis=0))
+
+
+def _turned(acc, about):
+    """By how much (rad) directions turn, of means over tenths of (n, 3); where the body turns about
+    a single axis (``about``), by how much more than that explains."""
     means = np.array([part.mean(axis=0) for part in np.array_split(acc, 10)])
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+    if len(about) == 1:
+        return float(np.ptp(np.arccos(np.clip(means[:, about[0]], -1.0, 1.0))))
     return float(np.arccos(np.clip((means @ means.T).min(), -1.0, 1.0)))
 
 

@@ -79,6 +79,16 @@ def test_an_axis_that_never_measures_is_named_only_where_the_body_turns_about_ot
     assert check_standing(ImuLog(np.arange(n) * 10_000_000, yaw, level), "imu") == []
 
 
+def test_a_body_that_turns_about_one_axis_alone_has_no_dead_ones():
+    """Simulated without noise: the other two rates are zero throughout, and should be."""
+    stamp = np.arange(800) * 10_000_000
+    angle = 0.9 * np.sin(stamp * 1e-9)
+    pitch = np.column_stack([0 * angle, 0.9 * np.cos(stamp * 1e-9), 0 * angle])
+    acc = 9.81 * np.column_stack([-np.sin(angle), 0 * angle, np.cos(angle)])
+    assert check_standing(ImuLog(stamp, pitch, acc), "imu") == []
+    assert check_standing(ImuLog(stamp, pitch, acc[:, [1, 0, 2]]), "imu")  # it turns about x
+
+
 def test_a_gyroscope_whose_steps_are_coarser_than_its_rest_is_not_dead():
     imu = recording(5)
     gyr = np.round(imu.gyr / 0.05) * 0.05
