@@ -165,10 +165,11 @@ def _judge_run(found, i, edge, floor):
     """Whether the present run of axis i, with a step ``edge`` at an end, is a flat top; the second
     at one level proves the limit."""
     level = 0.5 * (found.low[i] + found.high[i])
+    steep = edge - max(found.inner_step[i], found.quantum[i])    # a step of rounding is none
     if (found.counted[i] or found.count[i] < _RUN or level < _BAND_FLOOR * floor
             or found.moved[i] < BAND * level
             or found.high[i] < found.largest[i] * (1.0 - _SPREAD)
-            or (found.count[i] - 1) * (edge - found.inner_step[i]) < _STEEP * BAND * level):
+            or (found.count[i] - 1) * steep < _STEEP * BAND * level):
         return
     found.counted[i] = 1
     if (found.limit[i] == math.inf and found.level[i] > 0.0

@@ -20,6 +20,8 @@ from imu_fusion.kernels import njit
 _REFUTED = -50.0   # log odds that readings do not make up for: nobody asks any more
 #: Of the variances of mounting, that "zero" may be off: what they have in common is known exactly.
 _NEARLY = 1e-6
+#: Squares of sds, by which the mean moves before it is asked again, and share of the variances.
+_MOVED, _LEARNT = 0.03, 0.05
 
 
 class Exact(NamedTuple):
@@ -30,6 +32,7 @@ class Exact(NamedTuple):
     odds: np.ndarray      # (1,) log of how much likelier it is than that the mounting is off; -inf
     #                       where it is refuted, or nobody asks
     pull: np.ndarray      # (k,) the mean, by the inverse of its covariance
+    asked: np.ndarray     # (k + 1,) the mean when it was last asked, and the variances' sum, in sds
     work: np.ndarray      # (k, k + 1)
 
 
@@ -40,7 +43,7 @@ def make_exact(array: SensorArray, asks: bool = True) -> Exact:
     k = len(allowed)
     log_det = np.linalg.slogdet(known + np.diag(allowed))[1]
     return Exact(allowed, np.full(1, log_det), np.full(1, 0.0 if asks and k else -np.inf),
-                 np.zeros(k), np.zeros((k, k + 1)))
+                 np.zeros(k), np.full(k + 1, np.inf), np.zeros((k, k + 1)))
 
 
 @njit
@@ -51,6 +54,13 @@ def ask(exact, x, cov):
         return
     a, z, k = exact.work, exact.pull, len(exact.pull)
     first = len(x) - k
+    moved, known = 0.0, 0.0
+    for i in range(k):
+        moved += (x[first + i] - exact.asked[i]) ** 2 / exact.allowed[i]
+        known += cov[first + i, first + i] / exact.allowed[i]
+    if _NEARLY * moved < _MOVED and abs(known - exact.asked[k]) < _LEARNT * known:
+        return
+    exact.asked[:k], exact.asked[k] = x[first:], known
     for i in range(k):
         for j in range(i, k):
             a[i, j] = cov[first + i, first + j]
@@ -89,7 +99,8 @@ def change_of(exact, cov):
     """How the mean of the first states (18,) changes by the hypothesis; cov (N, N)."""
     first = len(cov) - len(exact.pull)
     change = np.zeros(BIAS)
-    for i in range(BIAS):
-        for k in range(len(exact.pull)):
-            change[i] -= cov[i, first + k] * exact.pull[k]
+    for k in range(len(exact.pull)):
+        row, pull = cov[first + k], exact.pull[k]
+        for i in range(BIAS):
+            change[i] -= row[i] * pull
     return change

@@ -19,6 +19,7 @@ from imu_fusion.estimation.acceleration_field.cross_check import (
     make_workspace,
 )
 from imu_fusion.estimation.acceleration_field.exact_mounting import (
+    Exact,
     ask,
     change_of,
     make_exact,
@@ -217,14 +218,14 @@ class RigidBodyFilter:
         self._exact = make_exact(array, asks)
         ask(self._exact, start.x, start.cov)
 
-    def get_state(self) -> tuple[State, np.ndarray, np.ndarray]:
+    def get_state(self) -> tuple[State, Exact]:
         """A copy of the memory, for :meth:`set_state`."""
-        return copied(self.state), self._exact.odds.copy(), self._exact.pull.copy()
+        return copied(self.state), Exact(*(member.copy() for member in self._exact))
 
-    def set_state(self, state: tuple[State, np.ndarray, np.ndarray]) -> None:
+    def set_state(self, state: tuple[State, Exact]) -> None:
         """Go on from where :meth:`get_state` was called."""
         self.state = copied(state[0])
-        self._exact = self._exact._replace(odds=state[1].copy(), pull=state[2].copy())
+        self._exact = Exact(*(member.copy() for member in state[1]))
 
     @property
     def share_of_exact(self) -> float:
