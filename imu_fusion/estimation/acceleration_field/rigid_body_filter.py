@@ -39,6 +39,7 @@ from imu_fusion.estimation.acceleration_field.measurement import (
     make_trace,
     update,
 )
+from imu_fusion.estimation.acceleration_field.misfit import widening
 from imu_fusion.estimation.acceleration_field.motion_model import (
     BIAS,
     OMEGA,
@@ -146,7 +147,7 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exa
         _fold(state)
         if found.learnt:
             ask(exact, state.x, state.cov)
-        _put(rows[n], p, state, exact)
+        _put(rows[n], p, channels, state, exact)
         flags |= found.flags
         residual = math.nan
         if found.used > 0:
@@ -159,10 +160,10 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exa
 
 
 @njit
-def _put(row, p, state, exact):
+def _put(row, p, channels, state, exact):
     """Fill a ROW by the State, moved to where the hypothesis that the mounting is exact has it, as
     far as that counts; that much further its mean may be off."""
-    cov, part = np.ascontiguousarray(state.cov[:BIAS, :BIAS]), share(exact)
+    cov, part = widening(state.x, channels) * state.cov[:BIAS, :BIAS], share(exact)
     s = parts(state.x)
     if part == 0.0:
         put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc, cov)

@@ -15,6 +15,7 @@ from imu_fusion.estimation.acceleration_field.measurement import (
     noise_variance,
     unused_flags,
 )
+from imu_fusion.estimation.acceleration_field.misfit import widening
 from imu_fusion.estimation.acceleration_field.motion_model import (
     ALPHA,
     BIAS,
@@ -251,7 +252,8 @@ def _put_smoothed(par, channels, stamp, readings, used, mean, cov, quat, rows):
                 quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
         _put_residual(row, p, channels, readings[n], used[n], mean[n])
         own = parts(mean[n])
-        put_rigid_row(row, p, quat, own.omega, own.alpha, own.acc, cov[n])
+        put_rigid_row(row, p, quat, own.omega, own.alpha, own.acc,
+                      widening(mean[n], channels) * cov[n])
 
 
 @njit

@@ -159,8 +159,8 @@ def _biases(fits, array, state):
         axes = ", ".join("xyz"[column % 3] for column in array.channels["column"][own])
         remarks.append(
             f"accelerometer '{fit.name}' fits best with biases of {_vector(bias, 2)} m/s^2 "
-            f"({axes}), far beyond their sd of {sd:.2g}, so what is stated is too small: calibrate "
-            f"it, or raise accelerometers.{fit.name}.bias_sd")
+            f"({axes}), far beyond their sd of {sd:.2g}; what is stated is larger by as much: "
+            f"calibrate it, or raise accelerometers.{fit.name}.bias_sd")
     return remarks
 
 
@@ -189,8 +189,8 @@ def _gyro_mounting(array, state):
         found.append(f"scales that are off by {_vector(100.0 * scale, 1)} % (sensor.gyro_scale_sd)")
     if np.any(np.abs(turn) > _BEYOND * own["axes_sd"][0]):
         found.append(f"axes turned by {_vector(np.degrees(turn), 1)} deg (sensor.gyro_axes_sd)")
-    return ["the gyroscope fits best with " + " and ".join(found) + ", so what is stated is too "
-            "small: calibrate it, or raise what is in brackets"] if found else []
+    return ["the gyroscope fits best with " + " and ".join(found) + "; what is stated is "
+            "larger by as much: calibrate it, or raise what is in brackets"] if found else []
 
 
 def _together(fits, array):
@@ -207,8 +207,8 @@ def _together(fits, array):
         return []
     return ["positions, axes and scales of the accelerometers, taken together, fit best "
             f"{np.sqrt(squares / number):.2g} times as far from what is described as their sds "
-            "say, so what is stated is too small: calibrate them, or raise sensor.acc_position_sd, "
-            "sensor.acc_axes_sd and sensor.acc_scale_sd"]
+            "say; what is stated is larger by as much: calibrate them, or raise "
+            "sensor.acc_position_sd, sensor.acc_axes_sd and sensor.acc_scale_sd"]
 
 
 def _states(state, index):

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.acceleration_field.estimator import AccelerationFieldEstimator
 from imu_fusion.estimation.acceleration_field.exact_mounting import ask, change_of, make_exact
+from imu_fusion.estimation.acceleration_field.misfit import widening
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
     AccelerometerParams,
@@ -68,9 +69,10 @@ def test_a_rig_that_is_off_is_found_out_and_what_is_stated_is_honest(motion, off
     """A tenth of the defaults is 0.1 mm, 0.2 deg and 0.1 %."""
     found = [result(motion, felt(motion, seed, off), sensors()) for seed in range(6)]
     assert all(estimator._filter.share_of_exact == 0.0 for _, _, estimator in found)
-    assert np.mean([nees for _, nees, _ in found]) < 4.5
+    honest = np.mean([nees for _, nees, _ in found])
+    assert honest < 4.5
     exact = [result(motion, felt(motion, seed, off), sensors(**EXACT)) for seed in range(6)]
-    assert np.mean([nees for _, nees, _ in exact]) > (6.0 if off > 0.2 else 3.5)    # itself is not
+    assert np.mean([nees for _, nees, _ in exact]) > 1.5 * honest    # the hypothesis itself is not
 
 
 def test_the_start_of_an_exact_rig_is_that_of_the_other_given_so(motion):
@@ -87,3 +89,22 @@ def test_the_start_of_an_exact_rig_is_that_of_the_other_given_so(motion):
         turn = (Rotation.from_quat(got.quat) * Rotation.from_rotvec(change[:3])).inv()
         assert (turn * Rotation.from_quat(expected.quat)).magnitude() < 2e-3
         assert np.allclose((got.x[:18] + change)[3:], expected.x[3:18], atol=2e-3)
+
+
+def test_what_is_no_constant_of_a_sensor_widens_what_is_stated(motion):
+    """An accelerometer 3 ms late: its biases and mounting take that as well as they can."""
+    late = []
+    for seed in range(4):
+        readings = felt(motion, seed)
+        readings[3:, 0] = readings[:-3, 0].copy()
+        _, nees, estimator = result(motion, readings, sensors())
+        late.append(nees)
+        assert widening(estimator._filter.state.x, estimator.array.channels) > 4.0
+    assert np.mean(late) < 10.0    # several times as much without it
+
+
+@pytest.mark.parametrize("off", [0.0, 1.0])
+def test_nothing_is_widened_by_what_was_said_of_the_sensors(motion, off):
+    for seed in range(4):
+        _, _, estimator = result(motion, felt(motion, seed, off), sensors())
+        assert widening(estimator._filter.state.x, estimator.array.channels) == 1.0
