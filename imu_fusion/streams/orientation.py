@@ -82,6 +82,11 @@ def turn_to_true_north(params: OrientationParams, stamp: int, sample: np.ndarray
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
+def _calibrated(params, output):
+    """Parameters with a magnetometer's calibration where the estimator reads it."""
+    return params.replace(**output.calibration.of_magnetometer(params.sensor))
+
+
 def _take(estimator, stamp, gyr, acc, mag_stamp, mag):
     """Samples through the estimator; returns its rows."""
     if len(stamp) + len(mag_stamp) > _FEW:
@@ -113,6 +118,7 @@ class OrientationStream(Stream):
     def __init__(self, params: OrientationParams = OrientationParams(),
                  output: OrientationOutputParams = OrientationOutputParams(),
                  warn: Callable[[str], object] = lambda text: None) -> None:
+        params = _calibrated(params, output)
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
@@ -180,6 +186,11 @@ class OrientationStream(Stream):
             imu, mag = (joined(parts) for parts in zip(*self._kept))
             self._kept = []
             made = self._run(imu, mag)
+            first = made[0].stamp[0] if made and len(made[0].stamp) else np.inf
+            early = int(np.sum(np.isfinite(imu[1]).all(axis=1) & (imu[0] < first)))
+            if early and made:
+                self.warn(f"{early} Imu samples before the rest from which the orientation starts "
+                          "are left out (alignment.start)")
         return made + self._write(self.estimator.finish())
 
     def conclude(self) -> Conclusion:
@@ -191,8 +202,8 @@ class OrientationStream(Stream):
 
     def change(self, params: OrientationParams) -> None:
         """Go on with other values of parameters that may change at run time."""
-        self.params = params
-        self.estimator.set_params(params)
+        self.params = _calibrated(params, self.output)
+        self.estimator.set_params(self.params)
 
     def set_heading(self, yaw: float) -> None:
         """Call the present yaw ``yaw`` (rad, counter-clockwise from above).

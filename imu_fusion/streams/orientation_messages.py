@@ -20,7 +20,7 @@ from imu_fusion.messages.orientation_status import (
 )
 from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE, transform_messages
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.sensors.linear_calibration import ImuCalibration
+from imu_fusion.sensors.linear_calibration import SensorCalibration
 from imu_fusion.streams.stream import Messages
 
 ORIENTATION_TOPIC = "imu/data"
@@ -50,7 +50,7 @@ class OrientationOutputParams(Parameters):
     publish_tf: bool = param(False, doc="Also write the orientation to /tf, from fixed_frame to "
                              "the frame of the Imu. The node needs tf2_msgs.")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
-    calibration: ImuCalibration = ImuCalibration()
+    calibration: SensorCalibration = SensorCalibration()
 
 
 def outputs_of(output: OrientationOutputParams) -> dict[str, str]:

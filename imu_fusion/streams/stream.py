@@ -20,7 +20,7 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.blocks import BlockMerger, Samples, joined
 from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Guard, Verdict
-from imu_fusion.sensors.linear_calibration import ImuCalibration
+from imu_fusion.sensors.linear_calibration import SensorCalibration
 
 IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
@@ -96,9 +96,9 @@ class Stream:
 
     def __init__(self, inputs: Mapping[str, SampleType],
                  warn: Callable[[str], object] = lambda text: None,
-                 calibration: ImuCalibration = ImuCalibration()) -> None:
+                 calibration: SensorCalibration = SensorCalibration()) -> None:
         self.inputs = inputs
-        self._calibration = None if calibration.is_identity else calibration
+        self._calibration = None if calibration.keeps_imu else calibration
         self.warn = warn
         self.undecodable: Counter[str] = Counter()
         self._merger = BlockMerger(inputs, self._refused, self.one_clock)

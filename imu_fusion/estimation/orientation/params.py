@@ -60,6 +60,12 @@ class SensorParams(Parameters):
 class AlignmentParams(Parameters):
     """``alignment.*``: the start."""
 
+    start: float | None = param(
+        None, unit="s", low=0.0,
+        doc="Where the first interval begins, since the first Imu sample; samples before it are "
+            "left out. Unset: with the first, or, where a recording is smoothed without "
+            "fusion.use_acc and begins in motion, with the last rest before the most violent "
+            "motion, which alone tells the tilt. Set it where a body is carried to where it lies.")
     duration: float = param(
         1.0, unit="s", low=0.05, high=60,
         doc="First interval, from which the orientation starts; rows come once it is over. "
