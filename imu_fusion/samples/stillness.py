@@ -82,7 +82,8 @@ def find_still(imu: ImuLog, noise: tuple[float, float], shortest: float = 1.0) -
             runs[-1] = runs[-1][0], last
         else:
             runs.append((first, last))
-    rests, size = [], fast * quick
+    rests: list[Still] = []
+    size = fast * quick
     for first, last in runs:
         begin = 0 if first == 0 else int(first) + _TRIM
         end = int(last) + _WINDOW - 1 - (_TRIM if last < len(unrest) else 0)

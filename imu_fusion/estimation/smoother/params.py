@@ -188,8 +188,9 @@ class Initial(Parameters):
 
     start: float | None = param(
         None, unit="s", low=0.0, doc="Where to begin, since the first Imu sample; samples before "
-        "it are left out, and other times count from there. Unset: with the first, or, where speed_sd says that the body is at rest "
-        "then and it is not, with the last rest before the most violent motion.")
+        "it are left out, and other times count from there. Unset: with the first, or, where "
+        "speed_sd says that the body is at rest then and it is not, with the last rest before the "
+        "most violent motion.")
     attitude_sd: float = param(
         0.5, unit="rad", low=1e-3, high=3.2, doc="Standard deviation of the first attitude.")
     position: tuple[float, ...] | None = param(

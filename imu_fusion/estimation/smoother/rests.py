@@ -9,7 +9,7 @@ import numpy as np
 from imu_fusion.estimation.smoother.imu_input import ImuInput
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.samples.logs import FixLog, Log, VelocityLog
+from imu_fusion.samples.logs import FixLog, VelocityLog
 from imu_fusion.samples.stillness import find_still
 
 _INTERVAL = 100_000_000   # ns, between velocities of zero
@@ -71,19 +71,15 @@ def _moves(rest, fix, velocity, frame):
     span = rest.first, rest.last + 1
     told = []
     if velocity is not None:
-        inside = _finite(velocity, velocity.vel_world).between(*span)
+        inside = velocity[np.isfinite(velocity.vel_world).all(axis=1)].between(*span)
         if len(inside):
             told.append(np.median(inside.vel_world, axis=0))
     if fix is not None:
-        inside = fix[fix.usable].between(*span)
-        if len(inside) >= _FEWEST:
-            place = frame.to_enu(inside.latitude_deg, inside.longitude_deg, inside.height)
-            told.append(_slope((inside.stamp - inside.stamp[0]) * 1e-9, place[:, :2]))
+        fixes = fix[fix.usable].between(*span)
+        if len(fixes) >= _FEWEST:
+            place = frame.to_enu(fixes.latitude_deg, fixes.longitude_deg, fixes.height)
+            told.append(_slope((fixes.stamp - fixes.stamp[0]) * 1e-9, place[:, :2]))
     return any(np.linalg.norm(v[:2]) > _SPEED for v in told)
-
-
-def _finite(log: Log, values: np.ndarray) -> Log:
-    return log[np.isfinite(values).all(axis=1)]
 
 
 def _slope(time, place):
