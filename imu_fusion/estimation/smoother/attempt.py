@@ -47,6 +47,7 @@ from imu_fusion.surfaces.hill import Hill
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
 _MOVES = 3.0         # standard deviations of a speed that is no rest
+_LIES = 1.0          # m, from the height of a sensor that stands to that of one that lies
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
@@ -75,12 +76,14 @@ class Model(NamedTuple):
     """What is taken to be true of a recording: ``params``; ``step_at``, stamp (ns) of the first
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
     standard deviations; ``repeats``: whether readings of the receiver that are the one before
-    exactly are measurements; ``rests``; None: those that the recording shows."""
+    exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
+    sensor is at its height above the profile; ``rests``; None: those that the recording shows."""
 
     params: SmootherParams
     step_at: int | None = None
     noise: Mapping[str, float] = {}
     repeats: bool = True
+    stands: bool = True
     rests: tuple[Rest, ...] | None = None
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
@@ -105,6 +108,8 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     first = first_place(given.fix, params.initial.position)
     frame = reference_frame(surface, first)
     constraints = surface.constraints() if surface is not None else ()
+    if not model.stands:
+        constraints = _lying(constraints, prepared.log, params)
     events = given.events
     detected = events is None and any(c.phase != "always" for c in constraints)
     if detected:
@@ -114,7 +119,8 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     if rests is None:
         rests = find_rests(prepared, given.fix, given.velocity, frame, params) if given.felt else ()
     while True:
-        found = _attempt(given, model, surface, prepared, frame, events, detected, rests)
+        found = _attempt(given, model, surface, constraints, prepared, frame, events, detected,
+                         rests)
         refuted = () if model.rests is not None else _refuted(found, rests)
         if not refuted:
             return found._replace(result=replace(found.result, rests=rests))
@@ -132,11 +138,10 @@ def _refuted(found, rests):
                         bool(begins))
 
 
-def _attempt(given, model, surface, prepared, frame, events, detected, rests):
+def _attempt(given, model, surface, constraints, prepared, frame, events, detected, rests):
     """Under the assumption of rests."""
     params = model.params
     first = first_place(given.fix, params.initial.position)
-    constraints = surface.constraints() if surface is not None else ()
     readings = _readings(given, model, frame, stamps_of(rests, prepared.log.stamp))
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
     around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
@@ -168,6 +173,13 @@ def _attempt(given, model, surface, prepared, frame, events, detected, rests):
         return best._replace(result=replace(best.result,
                                             gnss_step=GnssStep(model.step_at, offset, sd)))
     return best
+
+
+def _lying(constraints, log, params):
+    """With heights of the landing that tell, all together, no more than a metre."""
+    rows = (log.stamp[-1] - log.stamp[0]) * 1e-9 / params.surface.interval
+    return tuple(c if c.phase != "landing" else replace(c, sigma=_LIES * np.sqrt(rows))
+                 for c in constraints)
 
 
 def _readings(given, model, frame, rest):

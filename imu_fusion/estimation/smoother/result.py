@@ -94,6 +94,8 @@ class SmootherResult:
     attitudes are unknown; None: it does.
     ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
     or below it.
+    ``stands``: whether the sensor is at its height above the profile after a touch-down; False:
+    these heights hardly count.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
     ``left_out``: number of Imu samples before the start; ``start_found``: whether that was found.
@@ -121,6 +123,7 @@ class SmootherResult:
     wander: dict[str, float] = field(default_factory=dict)
     acc_density: float | None = None
     near_ground: float = 0.0
+    stands: bool = True
     lost_turns: tuple[int, ...] = ()
     rests: tuple[Rest, ...] = ()
     left_out: int = 0
