@@ -130,9 +130,9 @@ class AtRest(Parameters):
     """What is known of a body at rest."""
 
     found: bool = param(
-        True, doc="Whether the velocity is zero where the Imu shows nothing but its noise, gravity "
-        "and its bias, unless the receiver says that the body moves. false for a body that may "
-        "ride as smoothly as it lies, where no receiver tells.")
+        False, doc="Whether the velocity is zero where the Imu shows nothing but its noise, "
+        "gravity and its bias, unless the receiver says that the body moves. true for a body that "
+        "lies still at times and never rides as smoothly: a ball in an avalanche.")
     shortest: float = param(
         1.0, unit="s", low=1.0, doc="Time for which it has to rest.")
     velocity_sd: float = param(
@@ -303,7 +303,7 @@ class SmootherParams(Parameters):
         if self.method == "extended_rts":
             return dict.fromkeys(_NOT_IN_THE_PAPER, "with method 'extended_rts'")
         idle = {} if self.rest.found else dict.fromkeys(
-            ("rest.shortest", "rest.velocity_sd"), "with rest.found false")
+            ("rest.shortest", "rest.velocity_sd"), "without rest.found")
         for group, of in (("gnss", self.gnss), ("mag", self.mag)):
             if of.loss == "squared":
                 idle[f"{group}.loss_scale"] = f"with {group}.loss 'squared'"

@@ -11,7 +11,7 @@ from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
 RATE, GRAVITY = 50.0, 9.8
 FRAME = LocalFrame(47.0, 11.0, 800.0)
 PARAMS = SmootherParams(gravity=GRAVITY, maximum_likelihood="off").replace(**{
-    "sensor.gyro_noise_density": 2e-4, "sensor.acc_noise_density": 4e-3,
+    "rest.found": True, "sensor.gyro_noise_density": 2e-4, "sensor.acc_noise_density": 4e-3,
     "sensor.acc_bias_sd": 0.02, "sensor.gyro_bias_sd": 2e-3,
     "initial.position": (47.0, 11.0, 800.0), "initial.position_sd": 0.1,
     "initial.attitude_sd": 0.02})
