@@ -44,7 +44,8 @@ def find_rests(prepared: ImuInput, fix: FixLog | None, velocity: VelocityLog | N
 def stamps_of(rests: Sequence[Rest], stamp: np.ndarray) -> np.ndarray:
     """(m,) ns, of the samples with stamps (N,) at which the velocity of rests is zero."""
     at = [np.arange(rest.first, rest.last + 1, _INTERVAL) for rest in rests]
-    return stamp[np.unique(np.searchsorted(stamp, np.concatenate([stamp[:0], *at])))]
+    found = np.searchsorted(stamp, np.concatenate([stamp[:0], *at]))
+    return stamp[np.unique(found[found < len(stamp)])]
 
 
 def contradicted(rests: Sequence[Rest], at: np.ndarray, innovations: np.ndarray, begins: bool

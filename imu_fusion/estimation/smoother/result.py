@@ -96,6 +96,7 @@ class SmootherResult:
     or below it.
     ``stands``: whether the sensor is at its height above the profile after a touch-down; False:
     these heights hardly count.
+    ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
     ``left_out``: number of Imu samples before the start; ``start_found``: whether that was found.
@@ -124,6 +125,7 @@ class SmootherResult:
     acc_density: float | None = None
     near_ground: float = 0.0
     stands: bool = True
+    late: dict[str, float] = field(default_factory=dict)
     lost_turns: tuple[int, ...] = ()
     rests: tuple[Rest, ...] = ()
     left_out: int = 0
