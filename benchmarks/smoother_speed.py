@@ -69,6 +69,10 @@ def _alone(target, *args):
     queue = context.Queue()
     child = context.Process(target=target, args=(*args, queue))
     child.start()
+    while queue.empty():
+        if child.exitcode:
+            raise ChildProcessError(f"{target.__name__} ended with {child.exitcode}")
+        time.sleep(0.1)
     answer = queue.get()
     child.join()
     return answer
@@ -97,7 +101,7 @@ def _measure_node(seconds, queue):
     from rclpy.executors import SingleThreadedExecutor
     from std_srvs.srv import Trigger
 
-    from imu_fusion.messages.convert import fix_message, imu_message, mag_message, velocity_message
+    from imu_fusion.messages.samples import sample_messages
     from imu_fusion.nodes.smoother import SmootherNode
 
     def mib(who):
@@ -108,18 +112,13 @@ def _measure_node(seconds, queue):
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     executor.add_node(client)
-    imu, mag, fix, velocity = drive(seconds)
-    push = node._collection.push
-    for i, stamp in enumerate(imu.stamp):
-        push("imu/data_raw", imu_message(int(stamp), "imu", imu.gyr[i], imu.acc[i]))
-        push("imu/mag", mag_message(int(stamp), "imu", mag.mag[i]))
-    for i, stamp in enumerate(fix.stamp):
-        push("fix", fix_message(int(stamp), "gnss", fix.latitude_deg[i], fix.longitude_deg[i],
-                                fix.height[i], fix.cov_enu[i]))
-        push("fix_velocity", velocity_message(int(stamp), "world", velocity.vel_world[i],
-                                              velocity.cov_world[i]))
-    del imu, mag, fix, velocity
-    collected, before = node._collection.bytes / 1e6, mib(resource.RUSAGE_SELF)
+    stream = node._stream
+    for topic, log in zip(stream.inputs, drive(seconds), strict=True):
+        cdrs = sample_messages(log)
+        for k in range(0, len(cdrs), 1000):
+            stream.take({topic: cdrs[k:k + 1000]})
+    del log, cdrs
+    collected, before = stream.bytes / 1e6, mib(resource.RUSAGE_SELF)
     service = client.create_client(Trigger, "smoother/smooth")
     future = service.call_async(Trigger.Request())
     start, longest = time.perf_counter(), 0.0

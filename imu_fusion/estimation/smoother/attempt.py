@@ -40,6 +40,7 @@ from imu_fusion.surfaces.hill import Hill
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
 _MOVES = 3.0         # standard deviations of a speed that is no rest
+_LIES = 1.0          # m, from the height of a sensor that stands to that of one that lies
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
@@ -68,12 +69,14 @@ class Model(NamedTuple):
     """What is taken to be true of a recording: ``params``; ``step_at``, stamp (ns) of the first
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
     standard deviations; ``repeats``: whether readings of the receiver that are the one before
-    exactly are measurements."""
+    exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
+    sensor is at its height above the profile."""
 
     params: SmootherParams
     step_at: int | None = None
     noise: Mapping[str, float] = {}
     repeats: bool = True
+    stands: bool = True
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -97,6 +100,8 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     first = first_place(given.fix, params.initial.position)
     frame = reference_frame(surface, first)
     constraints = surface.constraints() if surface is not None else ()
+    if not model.stands:
+        constraints = _lying(constraints, prepared.log, params)
     events = given.events
     detected = events is None and any(c.phase != "always" for c in constraints)
     if detected:
@@ -133,6 +138,13 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
         return best._replace(result=replace(best.result,
                                             gnss_step=GnssStep(model.step_at, offset, sd)))
     return best
+
+
+def _lying(constraints, log, params):
+    """With heights of the landing that tell, all together, no more than a metre."""
+    rows = (log.stamp[-1] - log.stamp[0]) * 1e-9 / params.surface.interval
+    return tuple(c if c.phase != "landing" else replace(c, sigma=_LIES * np.sqrt(rows))
+                 for c in constraints)
 
 
 def _readings(given, model, frame):

@@ -27,6 +27,7 @@ _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
 _FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
 _SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
+_BESIDE = 0.3        # m from the profile: as near as a contact is told to be
 _MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
@@ -55,8 +56,9 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     """
     given = model.params.to_mapping()
     found, model = _deep_landing(found, model, smooth)
+    found, model = _fall(found, model, smooth)
     if contradicted(found.result):
-        return found.result
+        return _adapted(found, model, given)
     if model.params.maximum_likelihood != "off":
         found, model = _bent_field(found, model, smooth)
     found, model = _repeated(found, model, smooth)
@@ -90,7 +92,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
 
 def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
-    return replace(found.result, noise=dict(model.noise), adapted={
+    return replace(found.result, noise=dict(model.noise), stands=model.stands, adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
 
@@ -112,6 +114,25 @@ def _deep_landing(found, model, smooth):
     better = is_doubtful(found.result) or (lands and tried.result.surface["landing"].first_excess
                                            < fit.first_excess)
     return (tried, other) if lands and better else (found, model)
+
+
+def _fall(found, model, smooth):
+    """With a body that lies after the touch-down at some height of its own, if it is beside the
+    profile then, and was not when it touched down; not compared by likelihood, as these rows do not
+    count."""
+    fit = found.result.surface.get("landing")
+    if found.result.jump is None or fit is None or not (
+            fit.excess > MOST_EXCESS or fit.first_excess > MOST_FIRST_EXCESS):
+        return found, model
+    other = model._replace(stands=False)
+    try:
+        tried = smooth(other)
+    except EstimationError:
+        return found, model
+    lies = (tried.result.jump is not None and not is_doubtful(tried.result)
+            and stands_at_touch_down(tried.result, tried.problem.constraints, other.params)
+            and abs(np.median(tried.result.surface["landing"].residual)) > _BESIDE)
+    return (tried, other) if lies else (found, model)
 
 
 def _repeated(found, model, smooth):

@@ -193,6 +193,14 @@ def _on_flight(result):
                "a deep landing; heights of that second are left out (jump.event_margin)")
 
 
+    if not result.stands:
+        beside = float(np.median(result.surface["landing"].residual))
+        yield (f"after the touch-down the sensor is {abs(beside):.1f} m "
+               f"{'above' if beside > 0.0 else 'below'} its height on the landing profile: a fall, "
+               "or another profile. Heights there hardly count; the length rests on in-run, flight "
+               "and fixes")
+
+
 def _on_surface(result):
     for name, fit in result.surface.items():
         if fit.silent > _SILENT:
