@@ -18,7 +18,8 @@ ARROWS = {
     "signals": (),
     "parameters": ("errors",),
     "geometry": ("errors", "kernels"),
-    "samples": ("errors",),
+    # One search for flat tops, the estimators'.
+    "samples": ("errors", "kernels"),
     "sensors": ("errors", "kernels", "parameters", "geometry", "samples"),
     "surfaces": ("errors", "kernels", "parameters", "geometry"),
     # The estimators do not know each other.

@@ -8,7 +8,7 @@ from imu_fusion.calibrate.files import parameter_text, read_topic
 from imu_fusion.errors import CalibrationError
 from imu_fusion.geometry.gravity import normal_gravity
 from imu_fusion.recordings.bag_reader import Lose
-from imu_fusion.samples.checks import flat_tops
+from imu_fusion.samples.flat_tops import GYRO_FLOOR, flat_tops
 from imu_fusion.samples.logs import ImuLog, seconds
 from imu_fusion.samples.rest import Rest, find_rests
 from imu_fusion.sensors.accelerometer_calibration import calibrate_accelerometer
@@ -69,7 +69,7 @@ def calibrate_recorded_gyroscope(bag: str | Path, topic: str = _IMU,
     """
     imu, _, remarks = read_topic(bag, topic, lose)
     rests = _rests(imu, bag)
-    if flat_tops(imu.gyr):
+    if flat_tops(imu.gyr, GYRO_FLOOR):
         raise CalibrationError(f"{bag}: the rates reach the end of the gyroscope's range: turn "
                                "it more slowly")
     force = imu.acc

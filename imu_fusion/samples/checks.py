@@ -15,6 +15,7 @@ import numpy as np
 from imu_fusion.errors import shown
 from imu_fusion.samples.disagreement import check_agreement
 from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.flat_tops import ACC_FLOOR, GYRO_FLOOR, MAG_FLOOR, flat_tops
 from imu_fusion.samples.logs import AccelerometerLog, FixLog, ImuLog, MagLog
 from imu_fusion.samples.standing import check_standing
 from imu_fusion.samples.travel import check_alternating
@@ -29,16 +30,11 @@ _AS_QUIET = 1.5   # times the least spread, which scatters by a tenth in half a 
 # Median norms of a field measured on Earth, with room for magnets and lost calibrations.
 _FIELD_T = (5e-6, 500e-6)
 _EARTH_T = (20e-6, 70e-6)
-# A flat top lasts three times as long as the values that the axis otherwise repeats (because
-# its steps are coarse, or because a slow sensor is read too often); an axis with fewer
-# distinct values than this is too coarse to tell.
 _ENOUGH = 20        # samples of which all lack something
 _HALVES = 0.2       # share of messages that hold one half alone
 _TURNED = 0.2       # rad: more than a sensor at rest does
 _UPSIDE_DOWN = 0.9  # share of gravity along -z
-_FLAT_TOP = 3
 _COARSE = 15.0      # m: GNSS under trees or in streets states less
-_DISTINCT = 20
 
 
 @dataclass(frozen=True)
@@ -79,16 +75,6 @@ class Timing:
             usual.interval_s, usual.jitter_s, self.gaps + later.gaps,
             float(np.fmax(self.longest_gap_s, later.longest_gap_s)),
             self.repeated + later.repeated, self.backwards + later.backwards)
-
-
-@dataclass(frozen=True)
-class FlatTop:
-    """Samples of one axis that stand still at its extreme value ``limit``."""
-
-    axis: int
-    limit: float
-    samples: int
-    runs: int
 
 
 def timing(stamp: np.ndarray) -> Timing:
@@ -167,52 +153,6 @@ def check_finite(values: np.ndarray, name: str, quantity: str) -> list[Finding]:
                            f"finite, first at sample {bad[0]}; they are left out")]
 
 
-def flat_tops(values: np.ndarray, limit: float | None = None) -> list[FlatTop]:
-    """Where axes stand still at their extreme: the mark of a saturated sensor.
-
-    Args:
-        values: (n, k).
-        limit: the sensor's range, if it is known; without it, a run of samples at exactly the
-            greatest or least value of the axis counts if it is three times as long as the runs
-            of equal values that the axis has anyway, and the signal enters or leaves it by
-            more than two of the axis's smallest steps (a round peak does not).
-
-    Returns:
-        list of FlatTop, negative ``limit`` for the lower end.
-    """
-    values = np.asarray(values, dtype=np.float64)
-    result = []
-    for axis in range(values.shape[1]):
-        column = values[:, axis][np.isfinite(values[:, axis])]
-        if len(column) == 0 or (limit is None and len(np.unique(column)) < _DISTINCT):
-            continue
-        if limit is None:
-            step = np.diff(np.unique(column)).min()
-            shortest = _FLAT_TOP * usual_run(column)
-        for sign in (1.0, -1.0):
-            signed = sign * column
-            top = signed.max() if limit is None else limit
-            starts, lengths = _runs(signed >= top)
-            if limit is None:
-                padded = np.concatenate([[top], signed, [top]])
-                edge = top - np.minimum(padded[starts], padded[starts + lengths + 1])
-                lengths = lengths[(lengths >= shortest) & (edge > 2 * step)]
-            if len(lengths):
-                result.append(FlatTop(axis, float(sign * top), int(lengths.sum()), len(lengths)))
-    return result
-
-
-def usual_run(values: np.ndarray) -> int:
-    """How many times values (n,) or rows (n, k) usually stand before they change: 1 for a
-    sensor that is read at its own rate, 3 for one that is read three times per measurement."""
-    values = np.asarray(values).reshape(len(values), -1)
-    changes = np.flatnonzero(np.any(values[1:] != values[:-1], axis=1))
-    if len(changes) < 2:
-        return 1
-    # The 95th percentile is beyond the beat of two rates, and below rare flat tops.
-    return max(int(np.percentile(np.diff(changes), 95)), 1)
-
-
 def check_held(values: np.ndarray, stamp: np.ndarray, name: str) -> list[Finding]:
     """A finding if samples (n, k) are mostly repetitions of the one before."""
     values = np.asarray(values)
@@ -226,12 +166,12 @@ def check_held(values: np.ndarray, stamp: np.ndarray, name: str) -> list[Finding
 
 
 def check_saturation(values: np.ndarray, name: str, quantity: str, unit: str,
-                     limit: float | None = None) -> list[Finding]:
-    """Findings about flat tops of ``values`` (n, 3)."""
+                     floor: float) -> list[Finding]:
+    """Findings about flat tops of ``values`` (n, 3); ``floor`` see :func:`.flat_tops`."""
     return [Finding("saturation",
                     f"{name}: {quantity} {'xyz'[top.axis]} stands at {top.limit:.6g} {unit} for "
                     f"{top.samples} samples in {top.runs} run{_s(top.runs)}: saturated")
-            for top in flat_tops(values, limit)]
+            for top in flat_tops(values, floor)]
 
 
 def check_acceleration(acc: np.ndarray, stamp: np.ndarray, name: str) -> list[Finding]:
@@ -342,7 +282,7 @@ def check_accelerometer(log: AccelerometerLog | ImuLog, name: str,
             *check_finite(log.acc, name, "acceleration"),
             *(check_acceleration(log.acc, log.stamp, name) if feels_gravity else ()),
             *check_held(log.acc, log.stamp, name),
-            *check_saturation(log.acc, name, "acceleration", "m/s^2")]
+            *check_saturation(log.acc, name, "acceleration", "m/s^2", ACC_FLOOR)]
 
 
 def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
@@ -360,15 +300,15 @@ def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
             *(check_standing(log, name) or check_turning(log, name)
               or check_agreement(log, name)),
             *check_held(np.hstack([log.gyr, log.acc]), log.stamp, name),
-            *check_saturation(log.gyr, name, "angular velocity", "rad/s"),
-            *check_saturation(log.acc, name, "acceleration", "m/s^2")]
+            *check_saturation(log.gyr, name, "angular velocity", "rad/s", GYRO_FLOOR),
+            *check_saturation(log.acc, name, "acceleration", "m/s^2", ACC_FLOOR)]
 
 
 def check_mag(log: MagLog, name: str = "imu/mag") -> list[Finding]:
     """All findings about a MagLog."""
     return [*check_stamps(log.stamp, name), *check_finite(log.mag, name, "the magnetic field"),
             *check_field(log.mag, name), *check_held(log.mag, log.stamp, name),
-            *check_saturation(log.mag, name, "the field", "T")]
+            *check_saturation(log.mag, name, "the field", "T", MAG_FLOOR)]
 
 
 def check_fix(log: FixLog, name: str = "fix") -> list[Finding]:
@@ -410,12 +350,6 @@ def _check_coarse(log, name):
 
 def _s(count: int) -> str:
     return "" if count == 1 else "s"
-
-
-def _runs(mask):
-    """(first indices, lengths) of the runs of True in a mask (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return edges[::2], edges[1::2] - edges[::2]
 
 
 def _quiet_blocks(values, stamp):

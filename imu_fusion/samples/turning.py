@@ -24,6 +24,7 @@ _BETTER = 0.5           # of the spread: what the right hypothesis leaves of it
 _SHARE = 0.8            # of the windows in which it is better,
 _PROOF = 5.0            # by so many standard errors
 _EXPLAINED = 0.1        # of the spread is left where nothing is wrong and nothing disturbs
+_EXACTLY = 1e-3         # where there is no noise, either
 _GRAVITY = 9.81
 _LEAST_TURN = 0.26      # rad: frames that differ by less are a matter of calibration
 _PATH = 10.0            # rad that the rates say within a window: few sensors turn by more
@@ -147,6 +148,18 @@ def spread(turns: np.ndarray, vectors: np.ndarray, with_bias: bool = False) -> n
         bias = np.linalg.lstsq(normal, np.einsum("wnki,wnk->i", moved, carried), rcond=1e-2)[0]
         carried -= moved @ bias
     return np.asarray(np.mean(np.sum(carried ** 2, axis=2), axis=1))
+
+
+def gravity_follows(stamp: np.ndarray, gyr: np.ndarray, acc: np.ndarray) -> bool:
+    """Whether gravity turns exactly as the gyroscope says, and nothing else is felt, not even
+    noise; by stamps (n,) ns, rates and specific forces (n, 3)."""
+    windows = Windows(stamp, gyr, acc)
+    if not len(windows):
+        return False
+    right = windows.turns()
+    still = np.broadcast_to(np.eye(3), right.shape)
+    return bool(np.median(spread(right, windows.vectors) / spread(still, windows.vectors))
+                < _EXACTLY)
 
 
 def gravity_verdict(imu: ImuLog) -> Verdict:

@@ -40,7 +40,7 @@ def outputs_of(params: SmoothingParams) -> dict[str, str]:
 _SI = {"µT": "T", "%": "1", "ms": "s", "°": "rad"}    # of units in reports
 UNITS = {
     "latitude_deg": "deg", "longitude_deg": "deg", "height": "m", "gnss_lag": "s",
-    "velocity_lag": "s", "offset": "m", "antenna": "m", "stamp": "ns", "duration": "s",
+    "velocity_lag": "s", "late": "s", "offset": "m", "antenna": "m", "stamp": "ns", "duration": "s",
     **dict.fromkeys(("takeoff_stamp", "touchdown_stamp"), "ns"),
     **dict.fromkeys(("in_run_speed", "takeoff_speed", "landing_speed"), "m/s"),
     "takeoff_angle_deg": "deg", "flight_time": "s", "length": "m",
@@ -74,7 +74,8 @@ class Outcome:
             "iterations": result.iterations,
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
-            "velocity_lag": result.velocity_lag, "repeats": result.repeats,
+            "velocity_lag": result.velocity_lag, "late": result.late,
+            "repeats": result.repeats,
             "adapted": result.adapted, "noise": result.noise,
             "acc_density": result.acc_density,
             "states": {name: {"value": value.tolist(), "sd": sd.tolist()}

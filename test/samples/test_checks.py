@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.samples import checks
+from imu_fusion.samples.flat_tops import GYRO_FLOOR, flat_tops
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
 from imu_fusion.samples.turning import check_axes
 
@@ -139,26 +140,26 @@ def test_axes_are_judged_in_spite_of_a_noisy_magnetometer_and_not_at_rest():
 def test_clipped_peaks_are_saturation_and_round_peaks_are_not():
     imu, _ = recording(gyr_noise=1e-3)
     clipped = np.clip(imu.gyr, -1.5, 1.5)
-    tops = checks.flat_tops(clipped)
+    tops = flat_tops(clipped, GYRO_FLOOR)
     assert {(t.axis, np.sign(t.limit)) for t in tops} == {(i, s) for i in range(3) for s in (1, -1)}
     assert all(abs(t.limit) == 1.5 for t in tops)
     assert sum(t.samples for t in tops if t.axis == 0) == pytest.approx(
         np.sum(np.abs(clipped[:, 0]) >= 1.5), rel=0.05)
-    assert checks.flat_tops(imu.gyr) == []
+    assert flat_tops(imu.gyr, GYRO_FLOOR) == []
     assert kinds(checks.check_imu(ImuLog(imu.stamp, clipped, imu.acc))) == ["saturation"]
-    # With the sensor's range, single samples at it count too.
-    (top,) = checks.flat_tops(np.array([[0.0], [2.0], [0.5]]), limit=2.0)
-    assert (top.samples, top.limit) == (1, 2.0)
+    # One wild sample hides none of them.
+    clipped[500] = 90.0
+    assert len(flat_tops(clipped, GYRO_FLOOR)) == 6
 
 
 def test_coarse_steps_and_held_samples_are_not_saturation():
     imu, mag = recording()
     step = np.round(imu.gyr / 0.05) * 0.05
-    assert checks.flat_tops(step) == []
+    assert flat_tops(step, GYRO_FLOOR) == []
     held = MagLog(mag.stamp, mag.mag[np.arange(len(mag)) // 3 * 3])
     (finding,) = checks.check_mag(held)
     assert finding.kind == "held" and "33" in finding.text
-    assert checks.flat_tops(np.zeros((100, 3))) == []
+    assert flat_tops(np.zeros((100, 3)), GYRO_FLOOR) == []
 
 
 def test_values_that_are_not_finite_are_counted():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imu_fusion.samples.checks import check_imu
 from imu_fusion.samples.disagreement import check_agreement
@@ -79,14 +80,19 @@ def test_an_axis_that_never_measures_is_named_only_where_the_body_turns_about_ot
     assert check_standing(ImuLog(np.arange(n) * 10_000_000, yaw, level), "imu") == []
 
 
-def test_a_body_that_turns_about_one_axis_alone_has_no_dead_ones():
-    """Simulated without noise: the other two rates are zero throughout, and should be."""
+@pytest.mark.parametrize("turns", [(0.0, 0.9, 0.0), (0.7, 0.9, 0.0)])
+def test_a_body_that_turns_about_one_or_two_axes_alone_has_no_dead_ones(turns):
+    """Simulated without noise: the other rates are zero throughout, and should be."""
     stamp = np.arange(800) * 10_000_000
-    angle = 0.9 * np.sin(stamp * 1e-9)
-    pitch = np.column_stack([0 * angle, 0.9 * np.cos(stamp * 1e-9), 0 * angle])
-    acc = 9.81 * np.column_stack([-np.sin(angle), 0 * angle, np.cos(angle)])
-    assert check_standing(ImuLog(stamp, pitch, acc), "imu") == []
-    assert check_standing(ImuLog(stamp, pitch, acc[:, [1, 0, 2]]), "imu")  # it turns about x
+    gyr = turns * np.cos(np.outer(stamp * 1e-9, [1.3, 1.0, 1.0]))
+    steps = Rotation.from_rotvec(0.01 * 0.5 * (gyr[1:] + gyr[:-1]))
+    attitude = [Rotation.identity()]
+    for step in steps:
+        attitude.append(attitude[-1] * step)
+    acc = np.array([each.inv().apply([0.0, 0.0, 9.81]) for each in attitude])
+    assert check_standing(ImuLog(stamp, gyr, acc), "imu") == []
+    other = gyr[:, [1, 0, 2]] if turns[0] == 0.0 else gyr[:, [2, 0, 1]]
+    assert check_standing(ImuLog(stamp, other, acc), "imu")    # it turns about others
 
 
 def test_a_gyroscope_whose_steps_are_coarser_than_its_rest_is_not_dead():

@@ -6,15 +6,14 @@ import pytest
 
 from imu_fusion.errors import SampleError
 from imu_fusion.kernels import njit
-from imu_fusion.sensors.saturation import (
+from imu_fusion.samples.flat_tops import (
     BAND,
     FLAT_TOPS,
     LIMIT_TOLERANCE,
     mark_flat_tops,
-    recover_rates,
-    saturated_axes,
     start_flat_tops,
 )
+from imu_fusion.sensors.saturation import recover_rates, saturated_axes
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 
 

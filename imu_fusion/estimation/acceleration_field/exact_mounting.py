@@ -1,9 +1,11 @@
-"""Is the mounting exact? A hypothesis beside the filter that knows how far off it may be (numba).
+"""Is the mounting exact? A hypothesis within the filter that knows how far off it may be (numba).
 
 A filter with states of the mounting lets noise into them: of a rig that is as described it knows
-less than one without. So a second filter without these states runs beside it, until the readings
-refute it, and each counts as its likelihood says (Magill 1965). What is stated is about the first
-filter's mean all the same: that all sensors are turned or scaled alike no reading refutes.
+less than one without. That one need not be run: its mean is that of the first filter, given that
+these states are zero, and how much likelier it makes the readings is by how much their density at
+zero has grown (Savage-Dickey ratio: Verdinelli and Wasserman 1995). Each counts as that says
+(Magill 1965). What is stated is about the first filter's mean all the same: that all sensors are
+turned or scaled alike no reading refutes.
 """
 
 import math
@@ -11,94 +13,94 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.motion_model import BIAS, State
+from imu_fusion.estimation.acceleration_field.motion_model import BIAS
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
-from imu_fusion.estimation.acceleration_field.start import Start, folded
-from imu_fusion.geometry.rotation import (
-    quat_conjugate,
-    quat_exp,
-    quat_log,
-    quat_multiply,
-    quat_normalize,
-)
 from imu_fusion.kernels import njit
 
-_SURE = 10.0          # log odds beyond which a hypothesis is refuted, and none grows
-_CONTRADICTED = 12.5  # of it, where it leaves out what the other can explain: five sigma
-#: Variances of mounting below which it is not known, of the largest.
-_RANK = 1e-9
+_REFUTED = -50.0   # log odds that readings do not make up for: nobody asks any more
+#: Of the variances of mounting, that "zero" may be off: what they have in common is known exactly.
+_NEARLY = 1e-6
+#: Squares of sds, by which the mean moves before it is asked again, and share of the variances.
+_MOVED, _LEARNT = 0.03, 0.05
 
 
 class Exact(NamedTuple):
-    """The second filter; ``odds`` (1,) the log of how much likelier it is than the first, -inf
-    where it is refuted or nobody asks."""
+    """What is known of the hypothesis, changed in place; k states of mounting."""
 
-    state: State
-    channels: np.ndarray   # (m,) CHANNEL
-    odds: np.ndarray
-
-
-def exact_start(start: Start, array: SensorArray) -> Start:
-    """The Start of an array whose mounting is exact: ``start`` given that its states are zero."""
-    moving = BIAS + len(array.channels)
-    x, cov = start.x, start.cov
-    known = np.linalg.pinv(cov[moving:, moving:], rcond=_RANK, hermitian=True)
-    gain = known @ cov[moving:, :moving]
-    return folded(x[:moving] - x[moving:] @ gain,
-                  cov[:moving, :moving] - cov[:moving, moving:] @ gain, start.quat)
+    allowed: np.ndarray   # (k,) variances that count as zero
+    log_det: np.ndarray   # (1,) log determinant of their covariance before the first sample
+    odds: np.ndarray      # (1,) log of how much likelier it is than that the mounting is off; -inf
+    #                       where it is refuted, or nobody asks
+    pull: np.ndarray      # (k,) the mean, by the inverse of its covariance
+    asked: np.ndarray     # (k + 1,) the mean when it was last asked, and the variances' sum, in sds
+    work: np.ndarray      # (k, k + 1)
 
 
-@njit
-def weigh(odds, likelihood, exact_likelihood, use, exact_use):
-    """Take one sample into the odds (1,), in place: log likelihoods, and which channels (m,) bool
-    either filter used."""
-    change = exact_likelihood - likelihood
-    for c in range(len(use)):
-        if use[c] != exact_use[c]:
-            change = -_CONTRADICTED
-    odds[0] = min(odds[0] + change, _SURE)
-    if not odds[0] > -_SURE:
-        odds[0] = -math.inf
+def make_exact(array: SensorArray, asks: bool = True) -> Exact:
+    """The :class:`Exact` of an array with states of its mounting, before the first sample."""
+    known = array.mounting_covariance()
+    allowed = _NEARLY * np.diag(known)
+    k = len(allowed)
+    log_det = np.linalg.slogdet(known + np.diag(allowed))[1]
+    return Exact(allowed, np.full(1, log_det), np.full(1, 0.0 if asks and k else -np.inf),
+                 np.zeros(k), np.full(k + 1, np.inf), np.zeros((k, k + 1)))
 
 
 @njit
-def share(odds):
-    """What the second filter counts, of one."""
-    return 1.0 / (1.0 + math.exp(-odds)) if odds > -_SURE else 0.0
+def ask(exact, x, cov):
+    """Bring odds and pull of the Exact up to date, by the mean and the covariance of a state that
+    has learnt of its mounting; in place."""
+    if not exact.odds[0] > -math.inf:
+        return
+    a, z, k = exact.work, exact.pull, len(exact.pull)
+    first = len(x) - k
+    moved, known = 0.0, 0.0
+    for i in range(k):
+        moved += (x[first + i] - exact.asked[i]) ** 2 / exact.allowed[i]
+        known += cov[first + i, first + i] / exact.allowed[i]
+    if _NEARLY * moved < _MOVED and abs(known - exact.asked[k]) < _LEARNT * known:
+        return
+    exact.asked[:k], exact.asked[k] = x[first:], known
+    for i in range(k):
+        for j in range(i, k):
+            a[i, j] = cov[first + i, first + j]
+        a[i, i] += exact.allowed[i]
+        a[i, k] = x[first + i]
+    log_det, squares = 0.0, 0.0
+    for i in range(k):
+        # Rounding must not make it negative.
+        pivot = max(a[i, i], exact.allowed[i])
+        a[i, i] = pivot
+        log_det += math.log(pivot)
+        squares += a[i, k] * a[i, k] / pivot
+        for j in range(i + 1, k):
+            share = a[i, j] / pivot
+            row, of = a[j], a[i]
+            for c in range(j, k + 1):
+                row[c] -= share * of[c]
+    for i in range(k - 1, -1, -1):
+        left = a[i, k]
+        for j in range(i + 1, k):
+            left -= a[i, j] * z[j]
+        z[i] = left / a[i, i]
+    exact.odds[0] = 0.5 * (exact.log_det[0] - log_det - squares)
+    if exact.odds[0] < _REFUTED:
+        exact.odds[0] = -math.inf
 
 
 @njit
-def blend(row, other, part):
-    """Move a ROW towards that of the second filter, by a part of their difference, in place; that
-    much further its mean may be off."""
-    turn = quat_log(quat_multiply(quat_conjugate(row.quat), other.quat))
-    row.quat[:] = quat_normalize(quat_multiply(row.quat, quat_exp(turn, part)))
-    _widen(row.cov_attitude, turn, part)
-    _move(row.omega, row.cov_omega, other.omega, part)
-    _move(row.alpha, row.cov_alpha, other.alpha, part)
-    _move(row.specific_force, row.cov_specific_force, other.specific_force, part)
-    _move(row.acceleration_world, row.cov_acceleration_world, other.acceleration_world, part)
-    for i in range(3):
-        for j in range(3):
-            row.gradient[i, j] += part * (other.gradient[i, j] - row.gradient[i, j])
+def share(exact):
+    """What the hypothesis counts, of one."""
+    return 1.0 / (1.0 + math.exp(-exact.odds[0])) if exact.odds[0] > _REFUTED else 0.0
 
 
 @njit
-def _move(mean, cov, other, part):
-    change = other - mean
-    _widen(cov, change, part)
-    mean += part * change
-
-
-@njit
-def _widen(cov, change, part):
-    for i in range(3):
-        for j in range(3):
-            cov[i, j] += part * part * change[i] * change[j]
-
-
-@njit
-def blend_rows(rows, others, part):
-    """:func:`blend` of rows (n,) with others (n,), in place."""
-    for n in range(len(rows)):
-        blend(rows[n], others[n], part)
+def change_of(exact, cov):
+    """How the mean of the first states (18,) changes by the hypothesis; cov (N, N)."""
+    first = len(cov) - len(exact.pull)
+    change = np.zeros(BIAS)
+    for k in range(len(exact.pull)):
+        row, pull = cov[first + k], exact.pull[k]
+        for i in range(BIAS):
+            change[i] -= row[i] * pull
+    return change

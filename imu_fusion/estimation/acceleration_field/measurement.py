@@ -52,6 +52,7 @@ class Innovations(NamedTuple):
     log_likelihood: float
     used: int               # channels
     flags: int              # MISSING, SATURATED, LEFT_OUT
+    learnt: bool            # whether the mounting learnt from it
 
 
 def make_trace(samples: int, channels: int, size: int) -> Trace:
@@ -281,7 +282,8 @@ def update(state, p, channels, reading, at, work, trace, n, open_states):
         log_likelihood -= 0.5 * (math.log(2.0 * math.pi * total) + innovation * innovation / total)
         used += 1
     put_updates(state.cov, columns, totals, open_states)
-    return Innovations(squares, log_likelihood, used, flags)
+    learnt = open_states == len(state.x) or work.is_settled[0]
+    return Innovations(squares, log_likelihood, used, flags, learnt)
 
 
 @njit

@@ -4,15 +4,14 @@ import numpy as np
 
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.kernels import njit
-from imu_fusion.sensors.saturation import (
+from imu_fusion.samples.flat_tops import (
+    ACC_FLOOR,
     FLAT_TOPS,
+    GYRO_FLOOR,
     LIMIT_TOLERANCE,
     find_flat_tops,
     start_flat_tops,
 )
-
-# No accelerometer has a smaller range than +-2 g, no gyroscope than this.
-_ACC_FLOOR, _GYRO_FLOOR = 19.0, 1.0     # m/s^2, rad/s
 
 
 class RangeLimits:
@@ -62,7 +61,7 @@ def _mark(found, steps, ranges, accelerometers, readings):
     for n in range(len(readings)):
         for k in range(len(found)):
             felt = k < accelerometers
-            floor = _ACC_FLOOR if felt else _GYRO_FLOOR
+            floor = ACC_FLOOR if felt else GYRO_FLOOR
             if not np.isfinite(readings[n, k]).any():
                 continue    # lost: what comes next would seem to have jumped
             for i in range(3):

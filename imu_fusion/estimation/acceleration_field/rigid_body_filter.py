@@ -20,10 +20,10 @@ from imu_fusion.estimation.acceleration_field.cross_check import (
 )
 from imu_fusion.estimation.acceleration_field.exact_mounting import (
     Exact,
-    blend,
-    exact_start,
+    ask,
+    change_of,
+    make_exact,
     share,
-    weigh,
 )
 from imu_fusion.estimation.acceleration_field.hardly_known_rate import (
     is_hardly_known,
@@ -129,29 +129,24 @@ def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, wor
 
 
 @njit
-def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exact, exact_trace,
-                   exact_work):
+def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exact):
     """Filter n samples in order, in place; one of ``rows`` (n,) ROW each.
 
     par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, stamp: (n,) int64 ns,
-    readings: (n, m), trace: a Trace of one sample and work: a Workspace, to work in; exact: the
-    Exact beside it, with a Trace and a Workspace of its own.
+    readings: (n, m), trace: a Trace of one sample and work: a Workspace, to work in; exact: Exact.
     """
     p = par[0]
-    step, exact_step = _make_step(), _make_step()
-    at, exact_at = np.empty_like(state.x), np.empty_like(exact.state.x)
-    other = np.empty_like(rows[:1])
+    step = _make_step()
+    at = np.empty_like(state.x)
     only = np.int64(0)   # a literal 0 would compile what is called once more
     for n in range(len(stamp)):
-        flags, found = _filter_one(stamp[n], state, p, channels, readings[n], rows[n], at, step,
-                                   trace, work, only)
-        if exact.odds[0] > -math.inf:
-            _, beside = _filter_one(stamp[n], exact.state, p, exact.channels, readings[n], other[0],
-                                    exact_at, exact_step, exact_trace, exact_work, only)
-            weigh(exact.odds, found.log_likelihood, beside.log_likelihood, work.use, exact_work.use)
-            part = share(exact.odds[0])
-            if part > 0.0:
-                blend(rows[n], other[0], part)
+        flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
+        at[:] = state.x
+        found = _correct(state, p, channels, readings[n], at, True, True, step, work, trace, only)
+        _fold(state)
+        if found.learnt:
+            ask(exact, state.x, state.cov)
+        _put(rows[n], p, state, exact)
         flags |= found.flags
         residual = math.nan
         if found.used > 0:
@@ -164,17 +159,21 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exa
 
 
 @njit
-def _filter_one(stamp, state, p, channels, reading, row, at, step, trace, work, n):
-    """Take one sample into the State, and fill its ROW by that; returns the flags of the step to
-    it, and the Innovations."""
-    flags = _predict_to(stamp, state, p, channels, step, trace, n)
-    at[:] = state.x
-    found = _correct(state, p, channels, reading, at, True, True, step, work, trace, n)
-    _fold(state)
+def _put(row, p, state, exact):
+    """Fill a ROW by the State, moved to where the hypothesis that the mounting is exact has it, as
+    far as that counts; that much further its mean may be off."""
+    cov, part = np.ascontiguousarray(state.cov[:BIAS, :BIAS]), share(exact)
     s = parts(state.x)
-    put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc,
-                  np.ascontiguousarray(state.cov[:BIAS, :BIAS]))
-    return flags, found
+    if part == 0.0:
+        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc, cov)
+        return
+    change = part * change_of(exact, state.cov)
+    for i in range(BIAS):
+        for j in range(BIAS):
+            cov[i, j] += change[i] * change[j]
+    d = parts(change)
+    put_rigid_row(row, p, quat_normalize(quat_multiply(state.quat, quat_exp(d.theta))),
+                  s.omega + d.omega, s.alpha + d.alpha, s.acc + d.acc, cov)
 
 
 @njit
@@ -216,34 +215,28 @@ class RigidBodyFilter:
         self._work = make_workspace(array.channels)
         linearise(array.channels, start.x, self._work)
         self.state = _first_state(start, array)
-        beside = array.with_exact_mounting()
-        begun = exact_start(start, array)
-        may_be_off = len(start.x) > len(begun.x)
-        self._exact = Exact(_first_state(begun, beside), beside.channels,
-                            np.full(1, 0.0 if asks and may_be_off else -np.inf))
-        self._exact_one = make_trace(1, len(array.channels), len(begun.x))
-        self._exact_work = make_workspace(beside.channels)
-        linearise(beside.channels, begun.x, self._exact_work)
+        self._exact = make_exact(array, asks)
+        ask(self._exact, start.x, start.cov)
 
-    def get_state(self) -> tuple[State, State, np.ndarray]:
+    def get_state(self) -> tuple[State, Exact]:
         """A copy of the memory, for :meth:`set_state`."""
-        return copied(self.state), copied(self._exact.state), self._exact.odds.copy()
+        return copied(self.state), Exact(*(member.copy() for member in self._exact))
 
-    def set_state(self, state: tuple[State, State, np.ndarray]) -> None:
+    def set_state(self, state: tuple[State, Exact]) -> None:
         """Go on from where :meth:`get_state` was called."""
         self.state = copied(state[0])
-        self._exact = self._exact._replace(state=copied(state[1]), odds=state[2].copy())
+        self._exact = Exact(*(member.copy() for member in state[1]))
 
     @property
     def share_of_exact(self) -> float:
         """How likely it is, of one, that the mounting is exact."""
-        return float(share(self._exact.odds[0]))
+        return float(share(self._exact))
 
     def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
         rows = np.empty(len(stamp), ROW)
         filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._one,
-                       self._work, self._exact, self._exact_one, self._exact_work)
+                       self._work, self._exact)
         return rows
 
     @property

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_fusion.estimation.acceleration_field.exact_mounting import blend_rows, exact_start
+from imu_fusion.estimation.acceleration_field.exact_mounting import ask, make_exact, share
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.measurement import (
     RATE_ROWS,
@@ -51,22 +51,24 @@ class Adjoint(NamedTuple):
 class Smoothed(NamedTuple):
     """What :func:`smooth_once` gives of n samples."""
 
-    mean: np.ndarray    # (n, N)
+    mean: np.ndarray    # (n, N), moved to that of an exact mounting as far as that is likely
     cov: np.ndarray     # (n, 18, 18)
     used: np.ndarray    # (n, m) bool, which readings
     last: State         # after the last sample
 
 
 @njit
-def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
+def backward(adjoint, par, touched, trace, toward, smoothed, smoothed_cov):
     """Smooth the n samples of a Trace, from the last to the first. It inverts nothing, so
     constant biases and exact starts need no care.
 
     touched: (m, TOUCHED) states of the channels' rows. adjoint: :class:`Adjoint`, carries on from
-    the samples after these and ends before these. smoothed: (n, N); its theta is relative to the
-    predicted attitude. smoothed_cov: (n, 18, 18).
+    the samples after these and ends before these. toward: (N, 1) what the means move along, by
+    their covariances; that much further they may be off. smoothed: (n, N); its theta is relative to
+    the predicted attitude. smoothed_cov: (n, 18, 18).
     """
     p = par[0]
+    moves = np.any(toward != 0.0)
     vector, information = adjoint.vector, adjoint.information
     chain, chain_dt = np.empty((4, 4)), -1.0
     for n in range(len(trace.x) - 1, -1, -1):
@@ -76,6 +78,10 @@ def backward(adjoint, par, touched, trace, smoothed, smoothed_cov):
         part = np.ascontiguousarray(trace.cov[n][:BIAS])
         found = part[:, :BIAS] - part @ information @ part.T
         smoothed_cov[n] = 0.5 * (found + found.T)
+        if moves:
+            change = (trace.cov[n] @ (toward - information @ (trace.cov[n] @ toward)))[:, 0]
+            smoothed[n] -= change
+            smoothed_cov[n] += np.outer(change[:BIAS], change[:BIAS])
         _before_update(adjoint, touched, trace, n)
         if trace.dt[n] < 0.0:
             # Across a gap, only attitude, omega and biases are the same state.
@@ -148,30 +154,15 @@ def _add_change(spread, gain, c, touched, rows, changes):
         spread[j] += change[j] * across
 
 
-def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start, stamp: np.ndarray,
-           readings: np.ndarray) -> tuple[np.ndarray, State]:
-    """:func:`smooth_iterated`, beside the hypothesis that the mounting is exact: as far as the
-    filter has not refuted that, its rows count, see :mod:`.exact_mounting`."""
-    rows, last = smooth_iterated(params, array, start, stamp, readings)
-    begun = exact_start(start, array)
-    if len(begun.x) < len(start.x):
-        keeper = RigidBodyFilter(params, array, start, asks=True)
-        keeper.process(stamp, readings)
-        part = keeper.share_of_exact
-        if part > 0.0:
-            others, _ = smooth_iterated(params, array.with_exact_mounting(), begun, stamp, readings)
-            blend_rows(rows, others, part)
-    return rows, last
-
-
-def smooth_iterated(params: AccelerationFieldParams, array: SensorArray, start: Start,
+def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start,
                     stamp: np.ndarray, readings: np.ndarray) -> tuple[np.ndarray, State]:
     """The iterated smoother: rows (n,) ROW given all samples, and the State after the last one.
 
     The readings are linearised at the smoothed states of the previous iteration (Gauss-Newton on
     the posterior), until the angular velocity moves by less than a thousandth of its standard
     deviation or ``iteration.max`` are used up. The attitude is the integral of the smoothed
-    angular velocity, by Hermite quadrature and the fourth-order Magnus expansion.
+    angular velocity, by Hermite quadrature and the fourth-order Magnus expansion. All that is
+    beside the hypothesis that the mounting is exact, see :mod:`.exact_mounting`.
 
     Args:
         start: before the first sample.
@@ -199,7 +190,7 @@ def smooth_iterated(params: AccelerationFieldParams, array: SensorArray, start: 
 def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Start,
                 stamp: np.ndarray, readings: np.ndarray,
                 at: np.ndarray) -> Smoothed:
-    """One iteration; the arguments are those of :func:`smooth_iterated`.
+    """One iteration; the arguments are those of :func:`smooth`.
 
     at: (n, N) states to linearise at, or (0, N): at the filter's predictions.
     """
@@ -213,6 +204,7 @@ def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Star
         checkpoints.append(keeper.get_state())
         keeper.trace(stamp[i:j], readings[i:j], at[i:j], trace)
     last = copied(keeper.state)
+    toward = _toward_exact(array, last)
     mean = np.empty((len(stamp), size))
     cov = np.empty((len(stamp), BIAS, BIAS))
     used = np.empty((len(stamp), len(channels)), bool)
@@ -221,9 +213,20 @@ def smooth_once(params: AccelerationFieldParams, array: SensorArray, start: Star
         keeper.set_state(checkpoint)
         part = Trace(*(member[:j - i] for member in trace))
         keeper.trace(stamp[i:j], readings[i:j], at[i:j], part)
-        backward(adjoint, par, keeper.touched, part, mean[i:j], cov[i:j])
+        backward(adjoint, par, keeper.touched, part, toward, mean[i:j], cov[i:j])
         used[i:j] = part.total[:, :len(channels)] > 0.0
     return Smoothed(mean, cov, used, last)
+
+
+def _toward_exact(array, last):
+    """What moves means (N, 1) to those of an exact mounting, as far as that is likely by the State
+    after the last sample."""
+    exact = make_exact(array)
+    toward = np.zeros((len(last.x), 1))
+    if len(exact.pull):
+        ask(exact, last.x, last.cov)
+        toward[-len(exact.pull):, 0] = share(exact) * exact.pull
+    return toward
 
 
 @njit

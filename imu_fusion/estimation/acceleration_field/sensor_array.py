@@ -140,13 +140,6 @@ class SensorArray:
                     free += size
         return replace(self, channels=channels)
 
-    def with_exact_mounting(self) -> "SensorArray":
-        """This array, whose sensors are as described."""
-        channels = self.channels.copy()
-        for name, sd, _ in _MOUNTING:
-            channels[name], channels[sd] = -1, 0.0
-        return replace(self, channels=channels)
-
     def determines_alpha(self, max_condition: float) -> bool:
         """Whether a and alpha follow from the readings although S does not follow entirely."""
         matrix = self.scaled_design()

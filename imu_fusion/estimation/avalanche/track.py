@@ -19,9 +19,10 @@ from imu_fusion.estimation.orientation.estimator import OrientationEstimator
 from imu_fusion.estimation.orientation.gyro_limit import ranges_of
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.parameters.declare import Parameters, param
+from imu_fusion.samples.flat_tops import BAND
 from imu_fusion.samples.logs import ImuLog, MagLog, seconds
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, calibrate_magnetometer
-from imu_fusion.sensors.saturation import BAND, recover_rates, saturated_axes
+from imu_fusion.sensors.saturation import recover_rates, saturated_axes
 from imu_fusion.surfaces.constraint import Surface
 
 _FASTEST = 100.0   # rad/s: no ball turns faster

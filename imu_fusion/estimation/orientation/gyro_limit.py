@@ -3,16 +3,16 @@
 import numpy as np
 
 from imu_fusion.kernels import njit
-from imu_fusion.sensors.saturation import (
+from imu_fusion.samples.flat_tops import (
     BAND,
     FLAT_TOPS,
+    GYRO_FLOOR,
     find_flat_tops,
     mark_flat_tops,
     start_flat_tops,
 )
 
 _ALIKE = 0.05        # of a limit: what calibrations let those of the axes of one sensor differ by
-_FLOOR = 1.0         # rad/s: no gyroscope has a smaller range
 
 
 @njit
@@ -34,14 +34,14 @@ def find(found, ranges, gyr):
     Returns:
         int, bits of the axes at their limit, x first.
     """
-    return find_flat_tops(found, ranges, _FLOOR, False, gyr)
+    return find_flat_tops(found, ranges, GYRO_FLOOR, False, gyr)
 
 
 @njit
 def _find_all(found, par, gyr):
     ranges = par[0].sensor.gyro_range
     start(found[0], ranges)
-    mark_flat_tops(found, ranges, _FLOOR, False, gyr)
+    mark_flat_tops(found, ranges, GYRO_FLOOR, False, gyr)
 
 
 def ranges_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:

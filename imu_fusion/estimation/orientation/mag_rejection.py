@@ -1,5 +1,5 @@
 """Magnetometer samples that cannot be used: broken, too late, or at the end of the sensor's range,
-which is given or found from flat tops (sensors.saturation).
+which is given or found from flat tops (samples.flat_tops).
 """
 
 import numpy as np
@@ -7,16 +7,16 @@ import numpy as np
 from imu_fusion.estimation.orientation.imu_rejection import is_within
 from imu_fusion.estimation.orientation.rows import FLAG_MAG_SATURATED
 from imu_fusion.kernels import njit
-from imu_fusion.sensors.saturation import (
+from imu_fusion.samples.flat_tops import (
     FLAT_TOPS,
     LIMIT_TOLERANCE,
+    MAG_FLOOR,
     find_flat_tops,
     start_flat_tops,
 )
 
 _WILD_FIELD = 1e6          # T: what no sensor reports, whatever its unit
 _NO_FIELD = 1e-9           # T: zeros of a magnetometer that is not there; rooms shield to more
-_EARTH_FIELD = 70e-6       # T: a range below the Earth's field (up to 67 uT) is not searched for
 
 
 @njit
@@ -62,7 +62,7 @@ def is_saturated(found, ranges, mag):
         ranges: (3,) tesla, nan for an axis whose limit is to be found.
         mag: (3,) tesla, finite, as the sensor reports it, in order of arrival.
     """
-    return find_flat_tops(found, ranges, _EARTH_FIELD, True, mag) != 0
+    return find_flat_tops(found, ranges, MAG_FLOOR, True, mag) != 0
 
 
 def new_limit(par: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator
 from imu_fusion.estimation.orientation.gyro_limit import ranges_of
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
+from imu_fusion.samples.flat_tops import BAND
 from imu_fusion.samples.logs import ImuLog, MagLog
-from imu_fusion.sensors.saturation import BAND
 from imu_fusion.sensors.unmixing import unmix
 
 _WILD = 1.1    # limits: nothing that was clipped lies beyond, whatever a calibration mixes

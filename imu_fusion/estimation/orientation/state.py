@@ -10,7 +10,7 @@ import numpy as np
 
 from imu_fusion.estimation.orientation.error_state import PREDICTION, ROW, N
 from imu_fusion.estimation.orientation.hard_iron import HARD_IRON
-from imu_fusion.sensors.saturation import FLAT_TOPS
+from imu_fusion.samples.flat_tops import FLAT_TOPS
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
 MOST_REFUTING = 4     # rests that are remembered

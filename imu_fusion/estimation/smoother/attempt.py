@@ -24,6 +24,7 @@ from imu_fusion.estimation.smoother.problem import Problem, log_density
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
+from imu_fusion.estimation.smoother.sensor_lag import in_time
 from imu_fusion.estimation.smoother.state import StatePrior
 from imu_fusion.estimation.smoother.surface_fit import (
     misfit_at_landing,
@@ -70,13 +71,15 @@ class Model(NamedTuple):
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
     standard deviations; ``repeats``: whether readings of the receiver that are the one before
     exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
-    sensor is at its height above the profile."""
+    sensor is at its height above the profile; ``late``: "gyr" or "mag" -> s, by which these are
+    later than the accelerometer."""
 
     params: SmootherParams
     step_at: int | None = None
     noise: Mapping[str, float] = {}
     repeats: bool = True
     stands: bool = True
+    late: Mapping[str, float] = {}
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -96,7 +99,9 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     Raises: as :meth:`.smoother.Smoother.run`.
     """
     params = model.params
-    prepared = prepare_imu(given.imu, params)
+    imu, mag = in_time(given.imu, given.mag, model.late)
+    given = given._replace(mag=mag)
+    prepared = prepare_imu(imu, params)
     first = first_place(given.fix, params.initial.position)
     frame = reference_frame(surface, first)
     constraints = surface.constraints() if surface is not None else ()

@@ -13,10 +13,17 @@ import numpy as np
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.attempt import Attempt, Model
 from imu_fusion.estimation.smoother.gnss_step import find_steps
-from imu_fusion.estimation.smoother.measurements.registry import KINDS
+from imu_fusion.estimation.smoother.measurements.registry import (
+    FIX,
+    KINDS,
+    MEASUREMENTS,
+    MOVED_FIX,
+)
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
+from imu_fusion.estimation.smoother.problem import log_density
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
+from imu_fusion.estimation.smoother.sensor_lag import field_lag
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
 from imu_fusion.estimation.smoother.whiteness import correlation, wandering
 
@@ -25,6 +32,8 @@ _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
+_LAG_TRIES = 3       # what turns to and fro within a lag tells only a part of it
 _FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
 _SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
 _BESIDE = 0.3        # m from the profile: as near as a contact is told to be
@@ -60,6 +69,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     if contradicted(found.result):
         return _adapted(found, model, given)
     if model.params.maximum_likelihood != "off":
+        found, model = _other_time(found, model, smooth)
         found, model = _bent_field(found, model, smooth)
     found, model = _repeated(found, model, smooth)
     # Where fixes scatter more than stated, chance makes larger steps, and gains.
@@ -69,6 +79,10 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if chosen is other and _left(tried.result) <= max(1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
+    if model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations:
+        # A smooth path hardly contradicts fixes that are late by seconds.
+        for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
+            found, model = _try(found, model, other, smooth)
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
             or _many_outliers(found.result)):
@@ -92,7 +106,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
 
 def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
-    return replace(found.result, noise=dict(model.noise), stands=model.stands, adapted={
+    return replace(found.result, noise=dict(model.noise), stands=model.stands,
+                   late=dict(model.late), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
 
@@ -156,6 +171,32 @@ def _many_outliers(result):
     return any(is_many(outliers) for outliers in result.outliers().values())
 
 
+def _other_time(found, model, smooth):
+    """With a magnetometer, or rates, of another time."""
+    for _ in range(_LAG_TRIES):
+        mag, predicted = _field(found)
+        lag = field_lag(mag["stamp"], predicted, found.result.residuals.get("mag", predicted),
+                        bool(model.late))
+        # Recovered rates are of no single time.
+        if not lag or found.problem.imu.log.gyr_sd is not None:
+            break
+        best = found, model
+        for name, more in (("mag", lag), ("gyr", -lag)):
+            if model.late and name not in model.late:
+                continue
+            other = model._replace(late={name: model.late.get(name, 0.0) + more})
+            try:
+                tried = smooth(other)
+            except EstimationError:
+                continue
+            if _gained(tried, best[0]) > 0.0:
+                best = tried, other
+        if best[0] is found:
+            break
+        found, model = best
+    return found, model
+
+
 def _bent_field(found, model, smooth):
     """With a magnetometer that counts as much less as the field wanders; not compared by
     likelihood, which has no name for iron.
@@ -176,22 +217,28 @@ def _bent_field(found, model, smooth):
 
 def _field_wanders(found):
     """How much more the residuals along the field wander than white noise does."""
-    readings = found.problem.readings
-    mag = readings[readings["kind"] == KINDS["mag"]]
+    mag, field = _field(found)
     if not len(mag):
         return 1.0
-    left = found.result.residuals["mag"]
     # Not along what was read: noise has made that longer.
-    field = mag["value"] - np.linalg.solve(mag["whiten"], left[:, :, None])[:, :, 0]
     field /= np.linalg.norm(field, axis=1, keepdims=True)
-    along = np.sum(left * field, axis=1, keepdims=True)
+    along = np.sum(found.result.residuals["mag"] * field, axis=1, keepdims=True)
     return wandering(mag["stamp"], along)
 
 
+def _field(found):
+    """Magnetometer samples (m,) of records.READING, and what was expected of them (m, 3), in their
+    standard deviations."""
+    readings = found.problem.readings
+    mag = readings[readings["kind"] == KINDS["mag"]]
+    if not len(mag):
+        return mag, mag["value"]
+    read = np.einsum("nij,nj->ni", mag["whiten"], mag["value"])
+    return mag, read - found.result.residuals["mag"]
+
+
 def _delays(found, model):
-    # Velocities would have told more than that, see gnss_lag.
-    for sd in (0.2,) if "velocity" in found.result.innovations else (0.2, 2.0):
-        yield from _where_zero(model, {_DELAY: sd})
+    return _where_zero(model, {_DELAY: 0.2})
 
 
 def _velocity_delays(found, model):
@@ -263,8 +310,21 @@ def _try(found, model, other, smooth, gain=_GAIN):
         tried = smooth(other)
     except EstimationError:
         return found, model
+    return (tried, other) if _gained(tried, found) > gain else (found, model)
+
+
+def _gained(tried, found):
+    """By how much the log-likelihood is larger. Readings that another delay has moved beyond the
+    Imu count as such that fit."""
     gained = tried.result.log_likelihood - found.result.log_likelihood
-    return (tried, other) if gained > gain else (found, model)
+    before, after = (np.where(one.problem.readings["kind"] == MOVED_FIX, FIX,
+                              one.problem.readings["kind"]) for one in (found, tried))
+    for kind in np.unique(before):
+        of_kind = found.problem.readings[before == kind]
+        lost = len(of_kind) - np.count_nonzero(after == kind)
+        gained += lost * (log_density(of_kind) / len(of_kind)
+                          - 0.5 * len(MEASUREMENTS[kind].components))
+    return gained
 
 
 def _steps(result: SmootherResult, model: Model, scatter: float) -> Iterator[Model]:

@@ -28,6 +28,7 @@ _WANDERS = {
     "fix": "of the receiver: gnss.position_error_sd; a change of datum or antenna",
     "velocity": "of the receiver: gnss.velocity_error_sd",
     "mag": "of the field: iron nearby, sensor.mag_bias_sd"}
+_SENSORS = {"gyr": "rates of the gyroscope", "mag": "magnetometer samples"}
 _ADVICE = {m.name: m.advice for m in MEASUREMENTS}
 
 
@@ -85,6 +86,14 @@ def _on_stamps(result):
                "the recording, or see that both clocks are one")
 
 
+    for name, lag in result.late.items():
+        what, other = _SENSORS[name], _SENSORS["gyr" if name == "mag" else "mag"]
+        yield (f"{what} are {abs(lag) * 1e3:.0f} ms {'late' if lag > 0.0 else 'early'} against "
+               f"forces and {other}; they were taken so much "
+               f"{'earlier' if lag > 0.0 else 'later'}. Give all of them the stamps of their "
+               "measurements")
+
+
 def _on_repeats(result):
     told = [f"{count} of the {name} readings" for name, count in result.repeats.items() if count]
     if told:
@@ -122,6 +131,9 @@ def _on_adapted(result):
                if name != "jump.event_margin"}
     if adapted or result.noise:
         taken = [f"{name}: {_short(value)}" for name, value in adapted.items()]
+        if "gnss.time_offset_sd" in adapted:
+            delay, sd = (values[0, 0] for values in result.states["gnss_time_offset"])
+            taken.append(f"fixes {delay:.2f} s late (standard deviation {sd:.2f} s)")
         taken += [f"{factor:.2g} times the stated standard deviations of {name}"
                   for name, factor in result.noise.items()]
         yield ("with the noise as given the innovations are not white, or larger than stated; "

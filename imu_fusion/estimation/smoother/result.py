@@ -95,6 +95,7 @@ class SmootherResult:
     or below it.
     ``stands``: whether the sensor is at its height above the profile after a touch-down; False:
     these heights hardly count.
+    ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
@@ -121,6 +122,7 @@ class SmootherResult:
     acc_density: float | None = None
     near_ground: float = 0.0
     stands: bool = True
+    late: dict[str, float] = field(default_factory=dict)
     lost_turns: tuple[int, ...] = ()
     failure: str = ""
     log_likelihood: float = -np.inf

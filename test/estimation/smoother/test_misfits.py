@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.smoother_speed import FRAME, drive
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
@@ -237,3 +238,31 @@ def test_fixes_and_velocities_of_two_clocks(fixes, velocities):
     place = result.frame.to_enu(*walking.FRAME.to_geodetic(walk.position(
         (samples["stamp"] - recorded.imu.stamp[0]) * 1e-9)))
     assert np.sqrt(np.mean((samples["position_world"] - place) ** 2)) < 0.03
+
+
+@pytest.mark.parametrize("late", [{"gyr": 0.05}, {"mag": 0.1}])
+def test_which_of_gyroscope_and_magnetometer_is_late(late):
+    walk = walking.Walk(30.0, np.random.default_rng(8))
+    recorded = walking.record(walk, np.random.default_rng(9))
+    imu, mag = recorded.imu, recorded.mag
+    if "gyr" in late:
+        imu = dataclasses.replace(imu, gyr=np.roll(imu.gyr, 5, axis=0))
+        assert np.all(np.diff(imu.stamp) == 10_000_000)
+    else:
+        mag = later(mag, late["mag"])
+    result = Smoother().run(imu, mag, recorded.fix, recorded.velocity)
+    assert result.late == pytest.approx(late, abs=0.01)
+    assert any("late against" in text for text in result.remarks())
+    attitude = walk.attitude((imu.stamp - imu.stamp[0]) * 1e-9)
+    off = Rotation.from_quat(result.samples["quat_world_imu"]).inv() * attitude
+    assert nees(off.as_rotvec()[50:-50], result.samples["cov_attitude"][50:-50]).mean() < 6.0
+
+
+def test_fixes_of_metres_alone_tell_that_they_are_late():
+    walk = walking.Walk(70.0, np.random.default_rng(8))
+    recorded = walking.record(walk, np.random.default_rng(9), walking.WalkErrors(
+        stated_sd=(1.5, 1.5, 2.5), gnss=GnssErrors(position_sd=(1.5, 1.5, 2.5))))
+    result = Smoother().run(recorded.imu, recorded.mag, later(recorded.fix, 2.0))
+    (delay,), (sd,) = (values[0] for values in result.states["gnss_time_offset"])
+    assert abs(delay - 2.0) < 3 * sd < 1.5
+    assert any("s late (standard" in text for text in result.remarks())
