@@ -100,6 +100,7 @@ class OrientationEstimator:
         self._waiting = []
         self._waiting_imus = 0
         self._alignment: Alignment | None = None
+        self._before: np.ndarray | None = None
         self._lag = None if self.params.lag is None else FixedLag(self.params.lag)
 
     def _adopt(self, state):
@@ -234,8 +235,11 @@ class OrientationEstimator:
         corrected = self.take_corrected()
         self._counted = self._counts(best)
         self._counted["gaps"] += 1
-        iron = self._state["hard_iron"][0].copy()
+        iron, before = self._state["hard_iron"][0].copy(), self._state
+        if self._alignment is None:
+            before = self._before
         self._forget()
+        self._before = before
         self._state["hard_iron"] = iron    # which the sensor carries on
         self._state["hard_iron"]["count"] = 0
         self._state["waiting_flags"] |= FLAG_GAP
@@ -248,6 +252,7 @@ class OrientationEstimator:
         return dict(kind=self._kind(self.params), state=self._state.copy(),
                     waiting=list(self._waiting), counted=self._counted.copy(), yaw=self._yaw,
                     alignment=self._alignment, start_at=self._start_at,
+                    before=None if self._before is None else self._before.copy(),
                     lag=None if self._lag is None else self._lag.copy())
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -263,6 +268,7 @@ class OrientationEstimator:
         self._waiting = list(state["waiting"])
         self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
         self._alignment, self._start_at = state["alignment"], state["start_at"]
+        self._before = None if state["before"] is None else state["before"].copy()
         self._counted, self._yaw = state["counted"].copy(), state["yaw"]
         self._lag = None if state["lag"] is None else state["lag"].copy()
 
@@ -425,7 +431,7 @@ class OrientationEstimator:
                 quat_multiply(quat_exp((0.0, 0.0, turn)), self._alignment.quat_world_imu)))
         if self.params.sensor.mag_delay is not None:
             self._state["mag_lag"] = self.params.sensor.mag_delay - par["gyro_delay"]
-        kernel.initialise(self._state, par, self._alignment)
+        kernel.initialise(self._state, par, self._alignment, self._before)
         self._state["align_until"] = stamps[-1]
         return self._alignment.at_rest
 
