@@ -18,7 +18,6 @@ from benchmarks.table import write_table
 from imu_fusion.estimation.avalanche.dead_reckoning import BallSamples, central_force, dead_reckon
 from imu_fusion.estimation.avalanche.in_situ import Constraint, calibrate_in_situ
 from imu_fusion.estimation.avalanche.phases import NAMES, find_phases
-from imu_fusion.estimation.avalanche.start import find_motion
 from imu_fusion.estimation.avalanche.track import TrackParams, track_ball
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator
 from imu_fusion.estimation.orientation.params import OrientationParams
@@ -27,6 +26,7 @@ from imu_fusion.estimation.smoother import Smoother
 from imu_fusion.evaluation.consistency import nees
 from imu_fusion.parameters.file import parameters_for
 from imu_fusion.samples.logs import FixLog
+from imu_fusion.samples.motion_span import find_motion
 from imu_fusion.sensors.accelerometer_calibration import calibrate_accelerometer
 from imu_fusion.sensors.gyroscope_calibration import Turn, calibrate_gyroscope
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer

@@ -191,6 +191,73 @@ def seldom(rate, r, rng):
     return replace(r, mag=r.mag[::step])
 
 
+def scaled_force(size, r, rng):
+    """Accelerometer's scale off, each axis in a direction of its own."""
+    return _with(r, acc=r.imu.acc * (1.0 + size * rng.choice([-1.0, 1.0], 3)))
+
+
+def clipped_force(limit, r, rng):
+    return _with(r, acc=np.clip(r.imu.acc, -limit, limit))
+
+
+def drifting(size_deg, r, rng):
+    """Gyroscope's bias that grows from zero on, as in one that warms up."""
+    part = np.linspace(0.0, 1.0, len(r.imu))[:, None]
+    return _with(r, r.imu.gyr + np.radians(size_deg) * part * _direction(rng))
+
+
+def feels_force(size_deg, r, rng):
+    """Gyroscope that turns by forces, deg/s per m/s^2."""
+    return _with(r, r.imu.gyr + np.radians(size_deg) * r.imu.acc @ Rotation.random(
+        random_state=int(rng.integers(1 << 30))).as_matrix())
+
+
+def coarse(size_deg, r, rng):
+    """Gyroscope in steps, deg/s."""
+    step = np.radians(size_deg)
+    return _with(r, step * np.round(r.imu.gyr / step))
+
+
+def misaligned(size_deg, r, rng):
+    """Gyroscope turned in the case, its accelerometer not."""
+    return _with(r, Rotation.from_rotvec(np.radians(size_deg) * _direction(rng)).apply(r.imu.gyr))
+
+
+def late_rates(seconds, r, rng):
+    """Gyroscope behind its accelerometer."""
+    time = (r.imu.stamp - r.imu.stamp[0]) * 1e-9
+    return _with(r, np.column_stack([np.interp(time - seconds, time, v) for v in r.imu.gyr.T]))
+
+
+def jittered(seconds, r, rng):
+    """Stamps of when samples arrived, in order."""
+    stamp = np.sort(r.imu.stamp + (1e9 * seconds * rng.random(len(r.imu))).astype(np.int64))
+    kept = np.append(True, np.diff(stamp) > 0)
+    return _rows(replace(r, imu=ImuLog(stamp, r.imu.gyr, r.imu.acc)), np.flatnonzero(kept))
+
+
+def turned_magnetometer(size_deg, r, rng):
+    return _with(r, mag=Rotation.from_rotvec(np.radians(size_deg) * _direction(rng)).apply(r.mag.mag))
+
+
+def comes_later(size, r, rng):
+    """A magnet that is put into the case half-way, T."""
+    part = (r.mag.stamp > r.imu.stamp[0] + 0.5e9 * _duration(r))[:, None]
+    return _with(r, mag=r.mag.mag + size * part * _direction(rng))
+
+
+def swings(size, r, rng):
+    """A magnet that dangles from the case, T."""
+    time = (r.mag.stamp - r.mag.stamp[0])[:, None] * 1e-9
+    return _with(r, mag=r.mag.mag + size * np.sin(2.0 * np.pi * (0.7 * time + rng.random(3))))
+
+
+def stuck(r, rng):
+    """Magnetometer that repeats its last sample from half-way on."""
+    half = len(r.mag) // 2
+    return _with(r, mag=np.vstack([r.mag.mag[:half], np.tile(r.mag.mag[half], (len(r.mag) - half, 1))]))
+
+
 CHANGES = {
     "as recorded": (lambda r, rng: r, False),
     "turned in its case": (turned, False),
@@ -224,6 +291,18 @@ CHANGES = {
     "magnetometer late by 20 ms": (partial(delayed, 0.02), True),
     "magnetometer late by 50 ms": (partial(delayed, 0.05), True),
     "magnetometer at 10 Hz": (partial(seldom, 10.0), True),
+    "accelerometer's scale off by 2 %": (partial(scaled_force, 0.02), False),
+    "accelerometer clipped at 2 g": (partial(clipped_force, 19.6), False),
+    "gyroscope's bias grows to 2 deg/s": (partial(drifting, 2.0), False),
+    "gyroscope that feels forces, 0.1 deg/s per m/s^2": (partial(feels_force, 0.1), False),
+    "gyroscope in steps of 1 deg/s": (partial(coarse, 1.0), False),
+    "gyroscope turned by 3 deg against the accelerometer": (partial(misaligned, 3.0), False),
+    "gyroscope 20 ms behind the accelerometer": (partial(late_rates, 0.02), False),
+    "stamps late by up to 20 ms": (partial(jittered, 0.02), False),
+    "magnetometer turned by 5 deg": (partial(turned_magnetometer, 5.0), True),
+    "hard iron of 20 uT from half-way on": (partial(comes_later, 20e-6), True),
+    "magnet of 10 uT that swings": (partial(swings, 10e-6), True),
+    "magnetometer stuck from half-way on": (stuck, True),
 }
 """What is changed: a function of a Recording and a generator, and whether it needs a magnetometer."""
 

@@ -10,7 +10,7 @@ from imu_fusion.batch import estimate
 from imu_fusion.calibrate import inertial
 from imu_fusion.calibrate.magnetometer import calibrate_recorded_magnetometer
 from imu_fusion.cli import cli
-from imu_fusion.errors import CalibrationError, TopicError
+from imu_fusion.errors import CalibrationError, ParameterError, TopicError
 from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.geometry.magnetic_field import decimal_year, magnetic_field_world
 from imu_fusion.messages.convert import attitude_log, fix_message, imu_message, mag_message
@@ -19,6 +19,8 @@ from imu_fusion.recordings.bag_reader import open_bag
 from imu_fusion.recordings.bag_writer import BagWriter
 from imu_fusion.recordings.logs import read_log
 from imu_fusion.simulation.ball_sensors import EPOCH
+from imu_fusion.streams.orientation import OrientationStream
+from imu_fusion.streams.orientation_messages import OrientationOutputParams
 from imu_fusion.streams.smoother import SmootherStream
 from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
 
@@ -59,10 +61,15 @@ def test_the_command_writes_what_both_estimators_read(bag, tmp_path):
     out = tmp_path / "ball.yaml"
     result = CliRunner().invoke(cli, ["calibrate", "magnetometer", str(bag), "--out", str(out)])
     assert result.exit_code == 0 and "directions seen" in result.output
-    (orientation,) = parameters_for((OrientationParams,), "orientation_estimator", out)
+    orientation, output = parameters_for((OrientationParams, OrientationOutputParams),
+                                         "orientation_estimator", out)
     (smoother, _) = parameters_for((SmoothingParams, SmootherNodeParams), "smoother", out)
+    orientation = OrientationStream(orientation, output).params
+    smoother = smoother.with_calibrated_magnetometer()
     assert orientation.sensor.mag_offset == smoother.sensor.mag_offset == pytest.approx(
         OFFSET, abs=1e-7)
+    with pytest.raises(ParameterError, match="two calibrations"):
+        smoother.replace(**{"calibration.mag_bias": (1e-6, 0.0, 0.0)})
     shown = CliRunner().invoke(cli, ["calibrate", "magnetometer", str(bag)])
     text = shown.output[shown.output.index("# Magnetometer"):]
     assert yaml.safe_load(text) == yaml.safe_load(out.read_text())

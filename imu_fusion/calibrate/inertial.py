@@ -19,7 +19,7 @@ _IMU = "imu/data_raw"
 _STANDARD_GRAVITY = 9.80665
 _COVERAGE = 0.06     # of the directions: six sides
 _LEAST_NOISE = 2e-3  # m/s^2, of a mean: what a table leaves of stillness
-#: Prefixes of the parameters of :class:`imu_fusion.sensors.linear_calibration.ImuCalibration`.
+#: Prefixes of the parameters of :class:`imu_fusion.sensors.linear_calibration.SensorCalibration`.
 _SHORT = {"accelerometer": "acc", "gyroscope": "gyro"}
 _UNITS = {"accelerometer": "m/s\u00b2", "gyroscope": "rad/s"}
 

@@ -69,12 +69,13 @@ def magnetometer_report(found: MagCalibration) -> list[tuple[str, str]]:
 
 def magnetometer_parameters(found: MagCalibration, bag: str | Path) -> str:
     """A ROS 2 parameter file (YAML) for all nodes, with where it is from."""
-    values = {name: value for name, value in found.to_parameters().items()
-              if name.startswith("sensor.")}
+    values = {"calibration.mag_matrix": [float(v) for v in found.matrix.ravel()],
+              "calibration.mag_bias": [float(v) for v in found.bias]}
     worst = 1e6 * math.sqrt(found.cov.diagonal()[:3].max())
     return parameter_text(
         "magnetometer", values, bag,
-        [f"{found.samples} samples, {100 * found.coverage:.0f} % of the directions, offset good to "
+        ["x = A x~ + b,",
+         f"{found.samples} samples, {100 * found.coverage:.0f} % of the directions, offset good to "
          f"{worst:.2f} uT,", f"norm scatters by {1e6 * found.residual_sd:.2f} uT"],
         {"method": "ellipsoid", "residual_sd": float(found.residual_sd),
          "recorded_sd": float(found.recorded_sd),

@@ -112,7 +112,7 @@ def calibrate_noise(bag: str, topic: str, mag_topic: str, plot: str | None, out:
 def calibrate_magnetometer(bag: str, topic: str, out: str | None) -> None:
     """Hard and soft iron from BAG, in which the sensor turned about all axes.
 
-    Prints how well it is determined, and sensor.mag_offset and sensor.mag_matrix as the
+    Prints how well it is determined, and calibration.mag_matrix and calibration.mag_bias as the
     orientation estimator and the smoother take them.
     """
     from imu_fusion.calibrate import magnetometer

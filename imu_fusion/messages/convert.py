@@ -41,7 +41,8 @@ ABSENT[0, 0] = -1.0
 _COVARIANCE_KNOWN = 3
 
 # Of a decoded Imu: the first elements of the covariances of rates and specific force.
-_FIRST_COVARIANCES = slice(IMU["angular_velocity_covariance"].start, None, 12)
+_FIRST_COVARIANCES = [IMU[f"{name}_covariance"].start
+                      for name in ("angular_velocity", "linear_acceleration")]
 
 
 def imu_message(stamp: int, frame_id: str, gyr: ArrayLike | None, acc: ArrayLike | None,
@@ -196,12 +197,17 @@ def gyroscope_first_values(values: np.ndarray) -> np.ndarray:
 
 
 def _measured(values, absent_force):
-    result = np.concatenate([values[:, IMU["angular_velocity"]],
-                             values[:, IMU["linear_acceleration"]]], axis=1)
-    absent = values[:, _FIRST_COVARIANCES] == -1.0
-    if absent.any():
-        result[absent[:, 0], :3] = np.nan
-        result[absent[:, 1], 3:] = absent_force
+    return _without_absent(values, IMU["angular_velocity"].start, IMU["linear_acceleration"].start,
+                           *_FIRST_COVARIANCES, absent_force)
+
+
+@njit
+def _without_absent(values, gyr, acc, gyr_cov, acc_cov, absent_force):
+    result = np.empty((len(values), 6))
+    for k in range(len(values)):
+        for i in range(3):
+            result[k, i] = np.nan if values[k, gyr_cov] == -1.0 else values[k, gyr + i]
+            result[k, 3 + i] = absent_force if values[k, acc_cov] == -1.0 else values[k, acc + i]
     return result
 
 

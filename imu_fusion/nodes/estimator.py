@@ -72,7 +72,7 @@ class EstimatorNode(Node):
         if turn.begun is not None:
             self._stream.reset([self._names[topic] for topic in turn.begun])
         if turn.blocks:
-            yield from self._stream.take({self._names[topic]: [cdr for cdr, _ in messages]
+            yield from self._stream.answer({self._names[topic]: [cdr for cdr, _ in messages]
                                           for topic, messages in turn.blocks.items()})
         if turn.ended:
             yield from self._stream.end([self._names[topic] for topic in turn.ended])

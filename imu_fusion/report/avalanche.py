@@ -311,7 +311,7 @@ def _forces(slope):
 def _field(slope, mag):
     samples = slope.smoothed.result.samples[slope.rows]
     _, own, ours = np.intersect1d(mag.stamp, samples["stamp"], return_indices=True)
-    sensor = slope.smoothed.params.sensor
+    sensor = slope.smoothed.params.with_calibrated_magnetometer().sensor
     measured = (mag.mag[own] - sensor.mag_offset) @ np.reshape(sensor.mag_matrix, (3, 3)).T
     world = Rotation.from_quat(samples["quat_world_imu"][ours]).apply(measured)
     inclination, declination = angles_deg(world)

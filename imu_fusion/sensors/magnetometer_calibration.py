@@ -48,6 +48,11 @@ class MagCalibration:
     condition: float
     samples: int
 
+    @property
+    def bias(self) -> np.ndarray:
+        """b (3,) tesla of the form that all calibrations share, ``matrix @ mag + b``."""
+        return -self.matrix @ self.offset
+
     def apply(self, mag: ArrayLike) -> np.ndarray:
         """Calibrated field, (..., 3) tesla."""
         return (np.asarray(mag) - self.offset) @ self.matrix.T

@@ -1,6 +1,6 @@
 """The orientation estimator between its topics, live and in batch."""
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -82,6 +82,11 @@ def turn_to_true_north(params: OrientationParams, stamp: int, sample: np.ndarray
     return -declination(latitude, longitude, height, decimal_year(stamp))
 
 
+def _calibrated(params, output):
+    """Parameters with a magnetometer's calibration where the estimator reads it."""
+    return params.replace(**output.calibration.of_magnetometer(params.sensor))
+
+
 def _take(estimator, stamp, gyr, acc, mag_stamp, mag):
     """Samples through the estimator; returns its rows."""
     if len(stamp) + len(mag_stamp) > _FEW:
@@ -113,6 +118,7 @@ class OrientationStream(Stream):
     def __init__(self, params: OrientationParams = OrientationParams(),
                  output: OrientationOutputParams = OrientationOutputParams(),
                  warn: Callable[[str], object] = lambda text: None) -> None:
+        params = _calibrated(params, output)
         self.params, self.output = params, output
         self.estimator = OrientationEstimator(params)
         self._calibrator, self._screen = MagCalibrator(), MagScreen(params)
@@ -132,7 +138,7 @@ class OrientationStream(Stream):
         self._said_lost = False
         self._kept: list[tuple[Samples, Samples]] = []
 
-    def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
+    def use(self, samples: Mapping[str, Samples]) -> Iterator[Messages]:
         imu = samples.get(IMU_TOPIC, _NO_IMU)
         mag = samples.get(MAG_TOPIC, _NO_MAG)
         self._look_for_gaps(imu[0])
@@ -141,14 +147,13 @@ class OrientationStream(Stream):
         if self.params.mode == "smoothed":
             self._kept.append((imu, mag))
             self._writer.turn += turn
-            return []
-        made: list[Messages] = []
+            return
         if stamp is not None:
             before = [np.searchsorted(stamps, stamp) for stamps, _ in (imu, mag)]
-            made = self._run(*((s[:k], v[:k]) for (s, v), k in zip((imu, mag), before)))
+            yield from self._run(*((s[:k], v[:k]) for (s, v), k in zip((imu, mag), before)))
             imu, mag = ((s[k:], v[k:]) for (s, v), k in zip((imu, mag), before))
             self._writer.turn += turn
-        return made + self._run(imu, mag)
+        yield from self._run(imu, mag)
 
     def _look_for_gaps(self, stamps):
         """Say once that the body may have turned by more than linear errors describe in a gap."""
@@ -179,8 +184,14 @@ class OrientationStream(Stream):
         if self._kept:
             imu, mag = (joined(parts) for parts in zip(*self._kept))
             self._kept = []
-            made = self._run(imu, mag)
-        return made + self._write(self.estimator.finish())
+            found = list(self._run(imu, mag))
+            first = found[0].stamp[0] if found and len(found[0].stamp) else np.inf
+            early = int(np.sum(np.isfinite(imu[1]).all(axis=1) & (imu[0] < first)))
+            if early and found:
+                self.warn(f"{early} Imu samples before the rest from which the orientation starts "
+                          "are left out (alignment.start)")
+            made += found
+        return made + list(self._write(self.estimator.finish()))
 
     def conclude(self) -> Conclusion:
         return Conclusion(results={"units": UNITS} | self.estimator.summary(),
@@ -191,8 +202,8 @@ class OrientationStream(Stream):
 
     def change(self, params: OrientationParams) -> None:
         """Go on with other values of parameters that may change at run time."""
-        self.params = params
-        self.estimator.set_params(params)
+        self.params = _calibrated(params, self.output)
+        self.estimator.set_params(self.params)
 
     def set_heading(self, yaw: float) -> None:
         """Call the present yaw ``yaw`` (rad, counter-clockwise from above).
@@ -255,11 +266,11 @@ class OrientationStream(Stream):
 
     def _run(self, imu, mag):
         """Samples through the estimator: (stamps, values) of both."""
-        self._collect(*mag)
         stamp, values = imu
         force = _without_lost(values[:, 3:], self._has_force)
         self._has_force |= bool(force.any())
-        return self._write(_take(self.estimator, stamp, values[:, :3], force, *mag))
+        yield from self._write(_take(self.estimator, stamp, values[:, :3], force, *mag))
+        self._collect(*mag)
 
     def _collect(self, stamps, values):
         """Samples for a calibration of the magnetometer, as often as they may be new."""
@@ -270,8 +281,8 @@ class OrientationStream(Stream):
 
     def _write(self, rows):
         frame_id = self.frame_ids.get(IMU_TOPIC, "")
-        return (self._writer.messages(rows, frame_id)
-                + self._writer.corrected(self.estimator.take_corrected(), frame_id))
+        yield from self._writer.messages(rows, frame_id)
+        yield from self._writer.corrected(self.estimator.take_corrected(), frame_id)
 
 
 def warm_up(params: OrientationParams) -> None:
@@ -279,8 +290,8 @@ def warm_up(params: OrientationParams) -> None:
     stream = OrientationStream(params.replace(**{"alignment.duration": 0.05}))
     for i in range(20):
         stamp = np.array([i * 10_000_000])
-        stream.use({MAG_TOPIC: (stamp, np.array([[0.0, 2e-5, -4e-5]])),
-                    IMU_TOPIC: (stamp, np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 9.81]]))})
+        list(stream.use({MAG_TOPIC: (stamp, np.array([[0.0, 2e-5, -4e-5]])),
+                    IMU_TOPIC: (stamp, np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 9.81]]))}))
     stream.flush()    # with a lag: the smoother
 
 

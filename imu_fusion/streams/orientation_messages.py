@@ -1,6 +1,7 @@
 """What the orientation estimator publishes: its rows as messages."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from imu_fusion.messages.orientation_status import (
 )
 from imu_fusion.messages.transforms import TF_TOPIC, TF_TYPE, transform_messages
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.sensors.linear_calibration import ImuCalibration
+from imu_fusion.sensors.linear_calibration import SensorCalibration
 from imu_fusion.streams.stream import Messages
 
 ORIENTATION_TOPIC = "imu/data"
@@ -50,7 +51,7 @@ class OrientationOutputParams(Parameters):
     publish_tf: bool = param(False, doc="Also write the orientation to /tf, from fixed_frame to "
                              "the frame of the Imu. The node needs tf2_msgs.")
     fixed_frame: str = param("odom", doc="Parent frame of that transform.")
-    calibration: ImuCalibration = ImuCalibration()
+    calibration: SensorCalibration = SensorCalibration()
 
 
 def outputs_of(output: OrientationOutputParams) -> dict[str, str]:
@@ -90,22 +91,22 @@ class OrientationWriter:
         self.turn = 0.0
         self.yaw: float | None = None
 
-    def messages(self, rows: np.ndarray, frame_id: str) -> list[Messages]:
-        """Messages of rows, in order."""
+    def messages(self, rows: np.ndarray, frame_id: str) -> Iterator[Messages]:
+        """Messages of rows, in order; the orientations first, as they are waited for."""
         if not len(rows):
-            return []
+            return
         stamp = rows["stamp"]
         rows, cdrs = self._orientations(rows, frame_id)
+        yield Messages(ORIENTATION_TOPIC, stamp, cdrs)
         east = quat_rotate(rows["quat_world_imu"][-1], (1.0, 0.0, 0.0))
         self.yaw = math.atan2(self._up * east[1], east[0])
-        made = [Messages(ORIENTATION_TOPIC, stamp, cdrs),
-                Messages(RPY_TOPIC, stamp, rpy_messages(rows, frame_id)),
-                *self._status(rows, frame_id), *self._biases(rows, frame_id)]
         if self._output.publish_tf:
-            made.append(Messages(TF_TOPIC, stamp, transform_messages(
+            yield Messages(TF_TOPIC, stamp, transform_messages(
                 stamp, self._output.fixed_frame, frame_id, np.zeros((len(rows), 3)),
-                rows["quat_world_imu"])))
-        return made
+                rows["quat_world_imu"]))
+        yield Messages(RPY_TOPIC, stamp, rpy_messages(rows, frame_id))
+        yield from self._status(rows, frame_id)
+        yield from self._biases(rows, frame_id)
 
     def corrected(self, rows: np.ndarray, frame_id: str) -> list[Messages]:
         """Messages of rows that looking ahead has corrected."""

@@ -13,6 +13,7 @@ from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.estimation.orientation.recovered import recover
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.imu_input import from_start
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.messages.convert import SAMPLE_TYPES
 from imu_fusion.messages.layouts import FIX, IMU, MAG, TWIST
@@ -169,11 +170,17 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         ImuFusionError: with the reason, if there is no meaningful result.
     """
     surface = load_surface(params.surface.file) if params.surface.file else None
+    params = params.with_calibrated_magnetometer()
     imu, mag = logs.get(IMU_TOPIC), logs.get(MAG_TOPIC)
-    if imu is not None and params.recover_rates:
-        imu = recover(imu, mag, recovery_params(params))
-        params = params.replace(**{"sensor.gyro_range": None})
-    return Smoother(params, surface).run(imu, mag, logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC))
+    fix, velocity = logs.get(FIX_TOPIC), logs.get(VELOCITY_TOPIC)
+    if imu is None or not params.recover_rates:
+        return Smoother(params, surface).run(imu, mag, fix, velocity)
+    begun = from_start(imu, params)
+    known = params.replace(**{"sensor.gyro_range": None, "initial.start": None})
+    result = Smoother(known, surface).run(recover(begun, mag, recovery_params(params)), mag, fix,
+                                          velocity)
+    return replace(result, left_out=len(imu) - len(begun),
+                   start_found=params.initial.start is None)
 
 
 def recovery_params(params: SmootherParams) -> OrientationParams:

@@ -40,7 +40,8 @@ def outputs_of(params: SmoothingParams) -> dict[str, str]:
 _SI = {"µT": "T", "%": "1", "ms": "s", "°": "rad"}    # of units in reports
 UNITS = {
     "latitude_deg": "deg", "longitude_deg": "deg", "height": "m", "gnss_lag": "s",
-    "velocity_lag": "s", "late": "s", "offset": "m", "antenna": "m", "stamp": "ns", "duration": "s",
+    "velocity_lag": "s", "late": "s", "offset": "m", "antenna": "m", "stamp": "ns", "rests": "ns",
+    "duration": "s",
     **dict.fromkeys(("takeoff_stamp", "touchdown_stamp"), "ns"),
     **dict.fromkeys(("in_run_speed", "takeoff_speed", "landing_speed"), "m/s"),
     "takeoff_angle_deg": "deg", "flight_time": "s", "length": "m",
@@ -77,7 +78,8 @@ class Outcome:
             "velocity_lag": result.velocity_lag, "late": result.late,
             "repeats": result.repeats,
             "adapted": result.adapted, "noise": result.noise,
-            "acc_density": result.acc_density,
+            "acc_density": result.acc_density, "left_out": result.left_out,
+            "rests": [[rest.first, rest.last] for rest in result.rests],
             "states": {name: {"value": value.tolist(), "sd": sd.tolist()}
                        for name, (value, sd) in constant_states(result.states).items()},
             "outliers": {name: asdict(found) for name, found in result.outliers().items()}}

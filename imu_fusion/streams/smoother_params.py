@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from imu_fusion.errors import ParameterError
 from imu_fusion.estimation.smoother import SmootherParams
 from imu_fusion.estimation.smoother.params import SurfaceContact
 from imu_fusion.parameters.declare import Parameters, param
-from imu_fusion.sensors.linear_calibration import ImuCalibration
+from imu_fusion.sensors.linear_calibration import IDENTITY, ZERO, SensorCalibration
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SmoothingParams(SmootherParams):
         False, doc="First recover rates beyond the gyroscope's range from the magnetometer, as the "
         "orientation estimator does on a whole recording, and take them with their covariance. "
         "Set it for a body that tumbles beyond the range.")
-    calibration: ImuCalibration = ImuCalibration()
+    calibration: SensorCalibration = SensorCalibration()
     surface: SurfaceFile = SurfaceFile()
     frame: Frames = Frames()
     path_rate: float = param(10.0, unit="Hz", low=0.01, high=1000.0,
@@ -60,6 +60,16 @@ class SmoothingParams(SmootherParams):
     publish_tf: bool = param(
         False, doc="Also write the trajectory to /tf, from frame.world to the frame of the Imu. "
         "Not where another node publishes a parent of that frame. The node needs tf2_msgs.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.calibration.of_magnetometer(self.sensor)    # two calibrations are refused
+
+    def with_calibrated_magnetometer(self) -> Self:
+        """With ``calibration.mag_*`` as the smoother itself takes them."""
+        found = self.calibration.of_magnetometer(self.sensor)
+        return self.replace(**{**found, "calibration.mag_matrix": IDENTITY,
+                               "calibration.mag_bias": ZERO})
 
     def idle(self) -> dict[str, str]:
         idle = super().idle()

@@ -20,7 +20,7 @@ from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.blocks import BlockMerger, Samples, joined
 from imu_fusion.samples.checks import check_frames
 from imu_fusion.samples.guard import Guard, Verdict
-from imu_fusion.sensors.linear_calibration import ImuCalibration
+from imu_fusion.sensors.linear_calibration import SensorCalibration
 
 IMU_TOPIC, MAG_TOPIC = "imu/data_raw", "imu/mag"
 FIX_TOPIC, VELOCITY_TOPIC = "fix", "fix_velocity"
@@ -96,9 +96,9 @@ class Stream:
 
     def __init__(self, inputs: Mapping[str, SampleType],
                  warn: Callable[[str], object] = lambda text: None,
-                 calibration: ImuCalibration = ImuCalibration()) -> None:
+                 calibration: SensorCalibration = SensorCalibration()) -> None:
         self.inputs = inputs
-        self._calibration = None if calibration.is_identity else calibration
+        self._calibration = None if calibration.keeps_imu else calibration
         self.warn = warn
         self.undecodable: Counter[str] = Counter()
         self._merger = BlockMerger(inputs, self._refused, self.one_clock)
@@ -117,35 +117,20 @@ class Stream:
 
     def take(self, blocks: Mapping[str, Sequence[bytes]]) -> list[Messages]:
         """Take the CDR bytes of messages, by topic in order of arrival."""
-        return self.take_decoded({topic: self.inputs[topic].layout.decode_block(cdrs)
-                                  for topic, cdrs in blocks.items()})
+        return list(self.answer(blocks))
+
+    def answer(self, blocks: Mapping[str, Sequence[bytes]]) -> Iterator[Messages]:
+        """:meth:`take`, with what is waited for first: to be asked for to the end."""
+        return self._take({topic: self.inputs[topic].layout.decode_block(cdrs)
+                           for topic, cdrs in blocks.items()})
 
     def take_decoded(self, blocks: Mapping[str, Decoded]) -> list[Messages]:
         """:meth:`take` of messages that have been decoded already."""
-        samples = {}
-        for topic, block in blocks.items():
-            for reason in block.refused.values():
-                self.undecodable[topic] += 1
-                if _is_told(self.undecodable[topic]) and not self.concludes:
-                    self.warn(f"{topic}: message left out: {reason} "
-                              f"({self.undecodable[topic]} so far)")
-            if len(block.stamp):
-                if topic not in self.frame_ids:
-                    self.frame_ids[topic] = block.frame_ids[0]
-                    self._compare_frames()
-                if not self.concludes and not self._frames[topic].keys() >= set(block.frame_ids):
-                    self._frames[topic] |= dict.fromkeys(block.frame_ids)
-                    self._tell(f.text for f in check_frames(self._frames[topic], topic))
-                values = self.inputs[topic].values(block.values)
-                if self._calibration is not None and self.inputs[topic].layout is IMU:
-                    values = self._calibration.apply(values)
-                samples[topic] = block.stamp, values
-                self._look(topic, *samples[topic])
-        return self._through(self._merger.add(samples))
+        return list(self._take(blocks))
 
     def end(self, topics: Iterable[str]) -> list[Messages]:
         """Nothing more comes on these topics in this session."""
-        return self._through(self._merger.end(topics))
+        return list(self._through(self._merger.end(topics)))
 
     def finish(self) -> list[Messages]:
         """The end of the session: everything that is held back."""
@@ -172,7 +157,7 @@ class Stream:
         """Forget all samples; parameters stay."""
         raise NotImplementedError
 
-    def use(self, samples: Mapping[str, Samples]) -> list[Messages]:
+    def use(self, samples: Mapping[str, Samples]) -> Iterable[Messages]:
         """Samples of one epoch, all before those of the next call."""
         raise NotImplementedError
 
@@ -192,16 +177,36 @@ class Stream:
         """Texts about the first samples of ``topic``; ``logs`` maps topics to what there is."""
         return []
 
-    def _through(self, segments) -> list[Messages]:
-        made: list[Messages] = []
+    def _take(self, blocks: Mapping[str, Decoded]) -> Iterator[Messages]:
+        samples = {}
+        for topic, block in blocks.items():
+            for reason in block.refused.values():
+                self.undecodable[topic] += 1
+                if _is_told(self.undecodable[topic]) and not self.concludes:
+                    self.warn(f"{topic}: message left out: {reason} "
+                              f"({self.undecodable[topic]} so far)")
+            if len(block.stamp):
+                if topic not in self.frame_ids:
+                    self.frame_ids[topic] = block.frame_ids[0]
+                    self._compare_frames()
+                if not self.concludes and not self._frames[topic].keys() >= set(block.frame_ids):
+                    self._frames[topic] |= dict.fromkeys(block.frame_ids)
+                    self._tell(f.text for f in check_frames(self._frames[topic], topic))
+                values = self.inputs[topic].values(block.values)
+                if self._calibration is not None and self.inputs[topic].layout is IMU:
+                    values = self._calibration.apply(values)
+                samples[topic] = block.stamp, values
+                self._look(topic, *samples[topic])
+        return self._through(self._merger.add(samples))
+
+    def _through(self, segments) -> Iterator[Messages]:
         for segment in segments:
             if segment.restart:
                 self.warn("the clock was set back (or days ahead): the estimator starts anew")
-                made += self.flush()
+                yield from self.flush()
                 self.restarts += 1
                 self.restart()
-            made += self.use(segment.samples)
-        return made
+            yield from self.use(segment.samples)
 
     def _look(self, topic: str, stamp: np.ndarray, values: np.ndarray) -> None:
         """Have the first samples looked at, once there are enough of them, and once again when

@@ -56,8 +56,8 @@ def test_flags_come_when_they_change_and_biases_ten_times_a_second():
     rows["flags"][100:200] = st.FLAG_SATURATED
     rows["flags"][150:300] |= st.FLAG_STILL
     writer = OrientationWriter(OrientationParams(), OrientationOutputParams())
-    messages = list(one_by_one(writer.messages(rows[:170], "imu")
-                               + writer.messages(rows[170:], "imu")))
+    messages = [message for part in (rows[:170], rows[170:])
+                for message in one_by_one(writer.messages(part, "imu"))]
     flags = [flags_value(cdr) for topic, _, cdr in messages if topic == "imu/flags"]
     s, r = st.FLAG_SATURATED, st.FLAG_STILL
     assert flags == [(0, 0), (1_000_000_000, s), (1_500_000_000, s | r), (2_000_000_000, r),

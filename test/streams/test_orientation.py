@@ -22,7 +22,7 @@ def test_a_calibration_is_taken_over_by_every_method(values):
     directions = np.random.default_rng(1).normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     stamps = np.arange(len(directions), dtype=np.int64) * 100_000_000
-    stream.use({MAG_TOPIC: (stamps, 48e-6 * directions + [1e-5, 0.0, -5e-6])})
+    list(stream.use({MAG_TOPIC: (stamps, 48e-6 * directions + [1e-5, 0.0, -5e-6])}))
     found = stream.calibrate_magnetometer()
     params = stream.estimator.params
     assert params.sensor.mag_offset == pytest.approx([1e-5, 0.0, -5e-6], abs=1e-9)
@@ -57,8 +57,8 @@ def test_all_numbers_of_a_result_have_units():
     stream = OrientationStream()
     stamps = 10_000_000 * np.arange(200)
     force = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (200, 1))
-    stream.use({IMU_TOPIC: (stamps, force), MAG_TOPIC: (stamps, np.tile([0.0, 2e-5, -4e-5],
-                                                                        (200, 1)))})
+    mag = np.tile([0.0, 2e-5, -4e-5], (200, 1))
+    list(stream.use({IMU_TOPIC: (stamps, force), MAG_TOPIC: (stamps, mag)}))
     results = stream.conclude().results
     numbers = {name for name, value in results.items() if isinstance(value, float)}
     assert results["aligned"] and len(numbers) > 20 and numbers <= set(results["units"])
@@ -86,6 +86,6 @@ def test_samples_at_the_magnetometer_s_limit_do_not_bend_its_calibration(values)
     stream = OrientationStream(OrientationParams.from_mapping(values))
     stamps = (t * 1e9).astype(np.int64)
     for part in np.array_split(np.arange(len(t)), 37):
-        stream.use({MAG_TOPIC: (stamps[part], mag[part])})
+        list(stream.use({MAG_TOPIC: (stamps[part], mag[part])}))
     found = stream.calibrate_magnetometer()
     assert found.offset == pytest.approx([50e-6 * scale, 0.0, -5e-6 * scale], abs=4e-7 * scale)

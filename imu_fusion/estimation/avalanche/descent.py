@@ -12,8 +12,8 @@ from imu_fusion.estimation.avalanche.phases import (
     find_phases,
     flights,
 )
-from imu_fusion.estimation.avalanche.start import MotionSpan, find_motion
 from imu_fusion.samples.logs import ImuLog, seconds
+from imu_fusion.samples.motion_span import MotionSpan, find_motion
 
 
 @dataclass(frozen=True)

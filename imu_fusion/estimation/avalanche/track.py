@@ -14,13 +14,13 @@ from imu_fusion.estimation.avalanche.in_situ import (
     calibrate_in_situ,
 )
 from imu_fusion.estimation.avalanche.slope import fall_line, slope_axes
-from imu_fusion.estimation.avalanche.start import MotionSpan, find_motion
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator
 from imu_fusion.estimation.orientation.gyro_limit import ranges_of
 from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
 from imu_fusion.parameters.declare import Parameters, param
 from imu_fusion.samples.flat_tops import BAND
 from imu_fusion.samples.logs import ImuLog, MagLog, seconds
+from imu_fusion.samples.motion_span import MotionSpan, find_motion
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, calibrate_magnetometer
 from imu_fusion.sensors.saturation import recover_rates, saturated_axes
 from imu_fusion.surfaces.constraint import Surface

@@ -30,6 +30,7 @@ _STANDARD_GRAVITY = 9.80665
 # Field norms that differ by more than this factor from their median are outliers: hard iron
 # and motion change them by less.
 _NORM_FACTOR = 3.0
+_GRAVITY_SPREAD = 0.04     # m/s^2, of gravity on the ground about the standard one
 _NO_FORCE = 1e-3           # m/s^2
 # Below this share of the field horizontal, heading is noise: the magnetic poles.
 _HORIZONTAL_SHARE = 0.02
@@ -43,7 +44,8 @@ class Alignment:
     field_world (3,) tesla or None; gyr_bias (3,), gyr_bias_sd rad/s; at_rest;
     has_heading: whether a magnetometer fixed the heading; inclination (rad, down
     positive) and field_norm (tesla) of the mean field, nan without one; gravity
-    (m/s^2): norm of the mean specific force at rest, else the standard one.
+    (m/s^2): norm of the mean specific force at rest, else the standard one; acc_bias_sd
+    (m/s^2): as stated, or as large as that norm is off.
     """
 
     quat_world_imu: np.ndarray
@@ -56,6 +58,7 @@ class Alignment:
     inclination: float
     field_norm: float
     gravity: float
+    acc_bias_sd: float
 
 
 def triad(acc: np.ndarray, mag: np.ndarray, declination: float) -> np.ndarray:
@@ -164,7 +167,12 @@ def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: 
     lost = np.flatnonzero(saturated_axes(gyr, gyr_limits).any(axis=1))
     used = max(int(lost[0]), 1) if len(lost) else len(gyr)
     chain = _chain(imu_stamps[:used], gyr[:used] - bias)
-    up, gravity, tilt_variance = _tilt(chain, acc, at_rest, p.acc_bias_sd)
+    acc_bias_sd = p.acc_bias_sd
+    if at_rest:
+        # What the norm is off by is one component of the bias, and tells how large it is.
+        off = abs(float(np.linalg.norm(acc.mean(axis=0))) - _STANDARD_GRAVITY) - _GRAVITY_SPREAD
+        acc_bias_sd = math.hypot(acc_bias_sd, max(off, 0.0))
+    up, gravity, tilt_variance = _tilt(chain, acc, at_rest, acc_bias_sd)
 
     nan = float("nan")
     field_first, inclination, field_norm, has_heading = None, nan, nan, False
@@ -194,7 +202,8 @@ def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: 
         cov_attitude_world=np.diag([tilt_variance, tilt_variance, heading_variance]),
         field_world=None if field_first is None else r @ field_first,
         gyr_bias=bias, gyr_bias_sd=float(bias_sd), at_rest=at_rest, has_heading=has_heading,
-        inclination=inclination, field_norm=field_norm, gravity=gravity)
+        inclination=inclination, field_norm=field_norm, gravity=gravity,
+        acc_bias_sd=acc_bias_sd)
 
 
 def _rest(stamps, gyr, acc, p):

@@ -22,6 +22,7 @@ from imu_fusion.estimation.orientation.alignment import (
     usable_mags,
 )
 from imu_fusion.estimation.orientation.error_state import TAPE
+from imu_fusion.estimation.orientation.first_interval import from_start
 from imu_fusion.estimation.orientation.fixed_interval import smooth
 from imu_fusion.estimation.orientation.fixed_lag import FixedLag
 from imu_fusion.estimation.orientation.gyro_limit import limits_of
@@ -89,6 +90,7 @@ class OrientationEstimator:
 
     def reset(self) -> None:
         """Forget all samples: the next ones start a new alignment."""
+        self._start_at: int | None = None    # ns
         self._counted = np.zeros(1, COUNTS)
         self._yaw = 0.0
         self._forget()
@@ -98,6 +100,7 @@ class OrientationEstimator:
         self._waiting = []
         self._waiting_imus = 0
         self._alignment: Alignment | None = None
+        self._before: np.ndarray | None = None
         self._lag = None if self.params.lag is None else FixedLag(self.params.lag)
 
     def _adopt(self, state):
@@ -232,8 +235,11 @@ class OrientationEstimator:
         corrected = self.take_corrected()
         self._counted = self._counts(best)
         self._counted["gaps"] += 1
-        iron = self._state["hard_iron"][0].copy()
+        iron, before = self._state["hard_iron"][0].copy(), self._state
+        if self._alignment is None:
+            before = self._before
         self._forget()
+        self._before = before
         self._state["hard_iron"] = iron    # which the sensor carries on
         self._state["hard_iron"]["count"] = 0
         self._state["waiting_flags"] |= FLAG_GAP
@@ -245,7 +251,8 @@ class OrientationEstimator:
         """A snapshot for :meth:`set_state`: going on from it changes nothing."""
         return dict(kind=self._kind(self.params), state=self._state.copy(),
                     waiting=list(self._waiting), counted=self._counted.copy(), yaw=self._yaw,
-                    alignment=self._alignment,
+                    alignment=self._alignment, start_at=self._start_at,
+                    before=None if self._before is None else self._before.copy(),
                     lag=None if self._lag is None else self._lag.copy())
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -260,7 +267,8 @@ class OrientationEstimator:
         self._adopt(state["state"].copy())
         self._waiting = list(state["waiting"])
         self._waiting_imus = sum(len(event[1]) == 6 for event in self._waiting)
-        self._alignment = state["alignment"]
+        self._alignment, self._start_at = state["alignment"], state["start_at"]
+        self._before = None if state["before"] is None else state["before"].copy()
         self._counted, self._yaw = state["counted"].copy(), state["yaw"]
         self._lag = None if state["lag"] is None else state["lag"].copy()
 
@@ -348,6 +356,10 @@ class OrientationEstimator:
         if not is_imu_sample(self._sample) or (last is not None and stamp <= last):
             self._state["counts"]["imu_rejected"] += 1
             return self._chunk[:0]
+        if self._start_at is None:
+            self._start_at = stamp + round((self.params.alignment.start or 0.0) * 1e9)
+        if stamp < self._start_at:
+            return self._chunk[:0]
         self._waiting.append((stamp, self._sample.copy()))
         self._waiting_imus += 1
         first = next(s for s, v in self._waiting if len(v) == 6)
@@ -359,6 +371,9 @@ class OrientationEstimator:
         if self._alignment is not None or self._waiting:
             raise EstimationError("mode 'smoothed' needs the whole recording in one run(); "
                                   "reset() first, or use mode 'causal'")
+        if self._start_at is None:    # after a gap all that comes counts
+            imu = from_start(imu, self.params)
+            self._start_at = 0
         samples = np.hstack([imu.gyr, imu.acc])
         good = are_imu_samples(samples)
         if not good.any():
@@ -416,7 +431,7 @@ class OrientationEstimator:
                 quat_multiply(quat_exp((0.0, 0.0, turn)), self._alignment.quat_world_imu)))
         if self.params.sensor.mag_delay is not None:
             self._state["mag_lag"] = self.params.sensor.mag_delay - par["gyro_delay"]
-        kernel.initialise(self._state, par, self._alignment)
+        kernel.initialise(self._state, par, self._alignment, self._before)
         self._state["align_until"] = stamps[-1]
         return self._alignment.at_rest
 

@@ -177,11 +177,11 @@ def _take_mags(s, p):
     if count == 0:
         return
     step.mag_count = count
-    if s.clipped or s.step.dt > p.gap.max:
+    if p.seeks_iron and (s.clipped or s.step.dt > p.gap.max):
         hard_iron.interrupt(s.hard_iron)
     for n in range(count):
         sample = taken[n]
-        if not s.clipped:
+        if p.seeks_iron and not s.clipped:
             then = quat_multiply(s.history.quat, sample.turn)
             if hard_iron.add(s.hard_iron, s.stamp, then, sample.field):
                 s.iron_shown = True

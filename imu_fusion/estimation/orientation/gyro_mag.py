@@ -19,13 +19,11 @@ from imu_fusion.estimation.orientation import gyro_limit, imu_rejection, mag_que
 from imu_fusion.estimation.orientation.alignment import Alignment
 from imu_fusion.estimation.orientation.error_state import UNIFORM_VARIANCE
 from imu_fusion.estimation.orientation.rows import (
-    FLAG_ALIGNING,
     FLAG_GAP,
     FLAG_MAG_USED,
-    FLAG_NO_HEADING,
     FLAG_SATURATED,
     SATURATED_AXES_SHIFT,
-    write_attitude,
+    finish,
 )
 from imu_fusion.geometry.rotation import (
     quat_exp,
@@ -325,7 +323,6 @@ def _write(s, p, row, eq, phi):
     """The output row after a step by phi (3,)."""
     step, cov = s.step, s.printed.cov
     noise_dt = step.dt if step.dt > 0.0 else _FIRST_DT
-    row.stamp = s.stamp
     cov_world = np.empty((3, 3))
     for i in range(3):
         bias_var = cov[3 + i, 3 + i]
@@ -337,19 +334,8 @@ def _write(s, p, row, eq, phi):
                 rate = phi[i] / step.dt
         for j in range(3):
             cov_world[i, j] = cov[i, j]
-            row.cov_gyr[i, j] = row.cov_acc[i, j] = 0.0
         row.gyr[i] = rate
         row.cov_gyr[i, i] = var_gyr
-        row.acc[i] = step.acc[i]
-        row.cov_acc[i, i] = (p.sensor.acc_noise_density ** 2 / noise_dt
-                             + p.sensor.acc_bias_sd ** 2)
-        row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
-    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)
-    row.reliability = step.reliability
-    row.mag_count = step.mag_count
-    if not s.heading_known:
-        step.flags |= FLAG_NO_HEADING
-    if s.stamp <= s.align_until:
-        step.flags |= FLAG_ALIGNING
-    row.flags = step.flags
+    finish(row, s, p, p.sensor.acc_noise_density ** 2 / noise_dt + p.sensor.acc_bias_sd ** 2,
+           cov_world)

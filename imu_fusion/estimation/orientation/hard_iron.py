@@ -186,12 +186,10 @@ def search(iron: np.ndarray, stamps: np.ndarray, gyr: np.ndarray, limits: np.nda
     stamps, gyr = stamps[kept], np.ascontiguousarray(gyr[kept])
     lost = (saturated_axes(gyr, limits).any(axis=1)
             | (np.diff(stamps, prepend=stamps[:1]) > params.gap.max * 1e9))
-    # Sums are the filter's own, which comes past the same samples.
     tried = iron[:1].copy()
     found = bool(_search(tried, stamps, gyr - bias, lost, mag_stamps, mags,
                          params.fusion.mag_offset_sd))
-    for name in ("found", "offset", "cov"):
-        iron[name] = tried[name]
+    iron[:] = tried
     return found
 
 

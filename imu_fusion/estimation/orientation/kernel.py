@@ -28,16 +28,20 @@ CURSOR = np.dtype([("imu", "i8"), ("mag", "i8"), ("row", "i8")])
 """How far :func:`forward` is: samples taken of both logs, rows written."""
 
 
-def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment) -> None:
-    """Start a zeroed state from an Alignment."""
+def initialise(state: np.ndarray, par: np.ndarray, alignment: Alignment,
+               before: np.ndarray | None = None) -> None:
+    """Start a zeroed state from an Alignment; before: the state that ended in a gap."""
     state["quat_world_imu"] = alignment.quat_world_imu
     state["history"]["quat"] = 0.0, 0.0, 0.0, 1.0
     _start_limits(state, par)
     if par["as_printed"][0]:
         gyro_mag.initialise(state, alignment)
     else:
+        if before is not None:
+            bank.part(before, par)
         for k in range(len(state)):
-            first_state.initialise(state[k:k + 1], par[k:k + 1], alignment)
+            first_state.initialise(state[k:k + 1], par[k:k + 1], alignment,
+                                   None if before is None else before[k])
 
 
 @njit

@@ -7,12 +7,7 @@ import numpy as np
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation import wander
 from imu_fusion.estimation.orientation.gyro_model import rate_of_turn
-from imu_fusion.estimation.orientation.rows import (
-    FLAG_ALIGNING,
-    FLAG_NO_HEADING,
-    raise_to_limits,
-    write_attitude,
-)
+from imu_fusion.estimation.orientation.rows import finish, raise_to_limits
 from imu_fusion.kernels import njit
 
 _FIRST_DT = 1e-2           # s: step that stands in for the one before the first sample
@@ -28,7 +23,6 @@ def write(s, p, row, taped):
     cov_world = np.empty((3, 3))
     rate = rate_of_turn(s, step.gyr)
     var_acc = p.sensor.acc_noise_density ** 2 / noise_dt + cov[es.ACC_BIAS, es.ACC_BIAS]
-    row.stamp = s.stamp
     for i in range(3):
         bias_var = cov[es.GYRO_BIAS + i, es.GYRO_BIAS + i]
         var_gyr = density2 / noise_dt + bias_var
@@ -36,7 +30,6 @@ def write(s, p, row, taped):
             slot = es.GYRO_SCALE + 3 * i + j
             var_gyr += cov[slot, slot] * step.gyr[j] ** 2
             cov_world[i, j] = cov[i, j]
-            row.cov_gyr[i, j] = row.cov_acc[i, j] = 0.0
         cov_world[i, i] += density2 * since + s.block.noise[es.ATTITUDE + i]
         if (s.clipped >> i) & 1:
             var_gyr += (cov[es.CLIPPED_RATE + i, es.CLIPPED_RATE + i]
@@ -44,21 +37,9 @@ def write(s, p, row, taped):
                         + since ** 2 * cov[es.ANGULAR_ACC + i, es.ANGULAR_ACC + i])
         row.gyr[i] = rate[i]
         row.cov_gyr[i, i] = var_gyr
-        row.acc[i] = step.acc[i]
-        if p.lasting_acc_sd == 0.0:    # else it is mostly motion
-            row.acc[i] -= s.acc_bias[i]
-        row.cov_acc[i, i] = var_acc
-        row.gyr_bias[i] = s.gyro_bias[i]
         row.gyr_bias_sd[i] = math.sqrt(max(bias_var, 0.0))
     wander.widen(cov_world, wander.shown(s.wander), s.wander.overall)
     cov_world[2, 2] += min(s.heading_var + s.hard_iron.heading_var, es.UNIFORM_VARIANCE)
     if not taped:    # else the smoother does it, after its correction
         raise_to_limits(row.gyr, step.clipped, s.gyro_limit.limit)
-    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)
-    row.reliability = step.reliability
-    row.mag_count = step.mag_count
-    if not s.heading_known:
-        step.flags |= FLAG_NO_HEADING
-    if s.stamp <= s.align_until:
-        step.flags |= FLAG_ALIGNING
-    row.flags = step.flags
+    finish(row, s, p, var_acc, cov_world)

@@ -60,6 +60,12 @@ class SensorParams(Parameters):
 class AlignmentParams(Parameters):
     """``alignment.*``: the start."""
 
+    start: float | None = param(
+        None, unit="s", low=0.0,
+        doc="Where the first interval begins, since the first Imu sample; samples before it are "
+            "left out. Unset: with the first, or, where a recording is smoothed without "
+            "fusion.use_acc and begins in motion, with the last rest before the most violent "
+            "motion, which alone tells the tilt. Set it where a body is carried to where it lies.")
     duration: float = param(
         1.0, unit="s", low=0.05, high=60,
         doc="First interval, from which the orientation starts; rows come once it is over. "
@@ -314,7 +320,8 @@ def kernel_parameters(params: OrientationParams) -> np.ndarray:
     the hypothesis, how many differ without_field, gyro_delay,
     gyro_delay_sd, mag_delay_sd (s; zero where a delay is taken as known), declination, heading_sd
     (rad), frame_from_enu (4,), use_acc and rest_force (m/s^2; with gyro_mag neither the filter nor
-    its rest detector looks at the accelerometer), follows_field, as_printed.
+    its rest detector looks at the accelerometer), follows_field, as_printed; seeks_iron: the filter
+    looks for hard iron, which is the same under all hypotheses, and smoothed is looked for before.
     """
     f = params.fusion
     fields, factors = f.local_field_sd, f.gyro_factor
@@ -324,7 +331,9 @@ def kernel_parameters(params: OrientationParams) -> np.ndarray:
     if f.use_acc and f.lasting_acc_sd > 0.0:
         first.append((fields[-1], factors[0], f.lasting_acc_sd))
     rest = [(field, factor, 0.0) for field in fields[1:] for factor in factors]
-    return np.concatenate([_hypothesis(params, *each, len(first)) for each in first + rest])
+    out = np.concatenate([_hypothesis(params, *each, len(first)) for each in first + rest])
+    out["seeks_iron"][1:] = False
+    return out
 
 
 def _hypothesis(params: OrientationParams, local_field_sd: float, gyro_factor: float,
@@ -353,5 +362,6 @@ def _hypothesis(params: OrientationParams, local_field_sd: float, gyro_factor: f
         frame_from_enu=_WORLD_FRAMES[params.world_frame],
         use_acc=with_acc and params.fusion.use_acc,
         rest_force=params.fusion.rest_force if with_acc else math.inf,
+        seeks_iron=params.mode == "causal",
         follows_field=params.alignment.heading_anchor == "field",
         as_printed=params.is_as_printed)

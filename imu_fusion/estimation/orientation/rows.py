@@ -97,3 +97,29 @@ def write_attitude(row, p, quat, cov_world, mag, dt):
     row.quat_world_imu[:] = quat_normalize(quat_multiply(frame, ahead))
     write_cov_attitude(row, p, cov_world, quat_to_matrix(ahead), dt)
     row.mag_world[:] = quat_rotate(frame, quat_rotate(quat, mag))
+
+
+@njit
+def finish(row, s, p, var_acc, cov_world):
+    """The rest of a row that has rates with their variances and the biases' sds, after the step of
+    a state. var_acc: of the force; cov_world: of :func:`write_attitude`."""
+    step = s.step
+    row.stamp = s.stamp
+    for i in range(3):
+        row.acc[i] = step.acc[i]
+        if p.lasting_acc_sd == 0.0:    # else it is mostly motion
+            row.acc[i] -= s.acc_bias[i]
+        row.gyr_bias[i] = s.gyro_bias[i]
+        for j in range(3):
+            row.cov_acc[i, j] = 0.0
+            if i != j:
+                row.cov_gyr[i, j] = 0.0
+        row.cov_acc[i, i] = var_acc
+    write_attitude(row, p, s.quat_world_imu, cov_world, step.mag, step.dt)
+    row.reliability = step.reliability
+    row.mag_count = step.mag_count
+    if not s.heading_known:
+        step.flags |= FLAG_NO_HEADING
+    if s.stamp <= s.align_until:
+        step.flags |= FLAG_ALIGNING
+    row.flags = step.flags

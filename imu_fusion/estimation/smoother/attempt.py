@@ -8,7 +8,12 @@ import numpy as np
 
 from imu_fusion.errors import EstimationError
 from imu_fusion.estimation.smoother.gnss_step import GnssStep
-from imu_fusion.estimation.smoother.imu_input import first_place, prepare_imu, reference_frame
+from imu_fusion.estimation.smoother.imu_input import (
+    AT_REST,
+    first_place,
+    prepare_imu,
+    reference_frame,
+)
 from imu_fusion.estimation.smoother.initial import first_attitudes
 from imu_fusion.estimation.smoother.iterated import SOFTNESS, Solution, solve
 from imu_fusion.estimation.smoother.jump_events import JumpEvents, find_jump, refine_jump
@@ -16,12 +21,14 @@ from imu_fusion.estimation.smoother.jump_result import jump_result
 from imu_fusion.estimation.smoother.measurements.registry import (
     KINDS,
     MEASUREMENTS,
+    REST,
     prepare_readings,
 )
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.problem import Problem, log_density
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS
+from imu_fusion.estimation.smoother.rests import Rest, contradicted, find_rests, stamps_of
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.sensor_lag import in_time
@@ -34,7 +41,7 @@ from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import FOLLOWS, likeliest, near_ground
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.samples.logs import FixLog, ImuLog, Log, MagLog, VelocityLog
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
 from imu_fusion.surfaces.constraint import Surface
 from imu_fusion.surfaces.hill import Hill
 
@@ -72,7 +79,7 @@ class Model(NamedTuple):
     standard deviations; ``repeats``: whether readings of the receiver that are the one before
     exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
     sensor is at its height above the profile; ``late``: "gyr" or "mag" -> s, by which these are
-    later than the accelerometer."""
+    later than the accelerometer; ``rests``; None: those that the recording shows."""
 
     params: SmootherParams
     step_at: int | None = None
@@ -80,6 +87,7 @@ class Model(NamedTuple):
     repeats: bool = True
     stands: bool = True
     late: Mapping[str, float] = {}
+    rests: tuple[Rest, ...] | None = None
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -112,7 +120,34 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     if detected:
         events = find_jump(prepared.log, given.velocity, params.jump.takeoff,
                            params.jump.touchdown)
-    readings = _readings(given, model, frame)
+    rests = model.rests
+    if rests is None:
+        rests = find_rests(prepared, given.fix, given.velocity, frame, params) if given.felt else ()
+    while True:
+        found = _attempt(given, model, surface, constraints, prepared, frame, events, detected,
+                         rests)
+        refuted = () if model.rests is not None else _refuted(found, rests)
+        if not refuted:
+            return found._replace(result=replace(found.result, rests=rests))
+        rests = tuple(rest for rest in rests if rest not in refuted)
+
+
+def _refuted(found, rests):
+    """Those rests that an attempt contradicts."""
+    problem = found.problem
+    readings, first = problem.readings, int(problem.imu.log.stamp[0])
+    begins = (rests[:1] and rests[0].first == first
+              and problem.params.initial.speed_sd < AT_REST)
+    of_rest = readings["kind"] == REST
+    return contradicted(rests, readings["stamp"][of_rest], problem.fit["innovation"][of_rest],
+                        bool(begins))
+
+
+def _attempt(given, model, surface, constraints, prepared, frame, events, detected, rests):
+    """Under the assumption of rests."""
+    params = model.params
+    first = first_place(given.fix, params.initial.position)
+    readings = _readings(given, model, frame, stamps_of(rests, prepared.log.stamp))
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
     around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
     problem = Problem(prepared, params, readings, around, constraints,
@@ -152,13 +187,13 @@ def _lying(constraints, log, params):
                  for c in constraints)
 
 
-def _readings(given, model, frame):
-    """Readings of records.READING, under the model."""
+def _readings(given, model, frame, rest):
+    """Readings of records.READING, under the model; ``rest`` (m,) ns, stamps at rest."""
     fix, velocity = given.fix, given.velocity
     if not model.repeats:
         fix = None if fix is None else fix[is_news(fix)]
         velocity = None if velocity is None else velocity[is_news(velocity)]
-    logs: dict[str, Log | None] = {"velocity": velocity, "mag": given.mag}
+    logs: dict[str, Any] = {"velocity": velocity, "mag": given.mag, "rest": rest}
     if fix is not None and fix.usable.any():
         fix = fix[fix.usable]
         moved = fix.stamp >= (np.inf if model.step_at is None else model.step_at)
@@ -244,7 +279,7 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     innovations, residuals = {}, {}
     for kind, measurement in enumerate(MEASUREMENTS):
         of_kind = problem.readings["kind"] == kind
-        if np.any(of_kind):
+        if np.any(of_kind) and kind != REST:    # which is no reading, and judged by itself
             width = len(measurement.components)
             fit = problem.fit[of_kind]
             innovations[measurement.name] = (problem.readings["stamp"][of_kind],

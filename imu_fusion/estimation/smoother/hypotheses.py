@@ -64,6 +64,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         found: under ``model``. smooth: a model -> its Attempt.
     """
     given = model.params.to_mapping()
+    model = model._replace(rests=found.result.rests)    # likelihoods are of the same rows
     found, model = _deep_landing(found, model, smooth)
     found, model = _fall(found, model, smooth)
     if contradicted(found.result):

@@ -10,10 +10,14 @@ from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog
+from imu_fusion.samples.motion_span import last_rest
 from imu_fusion.surfaces.constraint import Surface
 
 _FAR = 50e3   # m from the origin of a surface, where its plane of axes no longer describes it
 _LEAST = 10   # Imu samples: of fewer, steps and noise of a sample have no meaning
+#: m/s: who states less of the first speed says that the body rests.
+AT_REST = 0.05
+_BEFORE = 2.0      # s of rest, from which on a recording that begins in motion is smoothed
 _FULL_SCALE = 0.999   # of a range from which on a reading counts as clipped: logs round it
 
 
@@ -49,6 +53,25 @@ def reference_frame(surface: Surface | None, first: tuple[float, ...]) -> LocalF
             f"{first[0]:.5f}, longitude {first[1]:.5f}): the surface is not that of this "
             "recording, or its origin is mistyped")
     return surface.origin
+
+
+def from_start(imu: ImuLog, params: SmootherParams) -> ImuLog:
+    """The Imu samples from ``initial.start`` on, or from the rest that is found in its place.
+
+    Raises:
+        SampleError: it lies behind them.
+    """
+    if params.initial.start is not None:
+        begin = int(np.searchsorted(imu.stamp, imu.stamp[:1] + round(
+            params.initial.start * 1e9))[0]) if len(imu) else 0
+    elif params.initial.speed_sd < AT_REST:
+        begin = last_rest(imu, _BEFORE)
+    else:
+        begin = 0
+    if begin and begin > len(imu) - _LEAST:
+        raise SampleError(f"initial.start: {params.initial.start} s lies at the end of the Imu "
+                          "samples or behind it")
+    return imu[begin:]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.smoother.measurements.registry import FIX, MAG, VELOCITY
+from imu_fusion.estimation.smoother.measurements.registry import FIX, MAG, REST, VELOCITY
 from imu_fusion.estimation.smoother.problem import Problem
 from imu_fusion.estimation.smoother.state import POS, VEL
 from imu_fusion.samples.logs import MagLog
@@ -73,9 +73,10 @@ def first_attitudes(problem: Problem, mag: MagLog | None, initial_quat: np.ndarr
         raise EstimationError("no fix lies within the Imu recording: do the stamps belong "
                               "together?")
     problem.mean[POS:POS + 3] = value[kind == FIX][0] if start is None else start
-    if np.any(kind == VELOCITY):
-        problem.mean[VEL:VEL + 3] = value[kind == VELOCITY][0]
     log = problem.imu.log
+    at_rest = problem.readings["stamp"][kind == REST]
+    if np.any(kind == VELOCITY) and not np.any(at_rest == log.stamp[0]):
+        problem.mean[VEL:VEL + 3] = value[kind == VELOCITY][0]
     beginning = int(np.searchsorted(log.stamp, log.stamp[0] + _FIRST))
     candidates = _HEADINGS if problem.params.initial.attitude_sd > _KNOWN_SD else 1
     if initial_quat is None:

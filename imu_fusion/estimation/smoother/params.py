@@ -126,6 +126,21 @@ class Mag(Parameters):
 
 
 @dataclass(frozen=True)
+class AtRest(Parameters):
+    """What is known of a body at rest."""
+
+    found: bool = param(
+        False, doc="Whether the velocity is zero where the Imu shows nothing but its noise, "
+        "gravity and its bias, unless the receiver says that the body moves. true for a body that "
+        "lies still at times and never rides as smoothly: a ball in an avalanche.")
+    shortest: float = param(
+        1.0, unit="s", low=1.0, doc="Time for which it has to rest.")
+    velocity_sd: float = param(
+        0.01, unit="m/s", low=1e-5, doc="Standard deviation of the velocity at rest, anew every "
+        "tenth of a second.")
+
+
+@dataclass(frozen=True)
 class SurfaceContact(Parameters):
     """How the body is held on a surface."""
 
@@ -171,6 +186,11 @@ class Initial(Parameters):
     """How far the first state may be from what is taken from the data. Smaller values claim to
     know it: a first attitude (Smoother.run), a body at rest."""
 
+    start: float | None = param(
+        None, unit="s", low=0.0, doc="Where to begin, since the first Imu sample; samples before "
+        "it are left out, and other times count from there. Unset: with the first, or, where "
+        "speed_sd says that the body is at rest then and it is not, with the last rest before the "
+        "most violent motion.")
     attitude_sd: float = param(
         0.5, unit="rad", low=1e-3, high=3.2, doc="Standard deviation of the first attitude.")
     position: tuple[float, ...] | None = param(
@@ -210,7 +230,7 @@ _NOT_IN_THE_PAPER = (
     "gnss.velocity_error_sd", "gnss.velocity_error_tau", "gnss.time_offset_sd",
     "gnss.velocity_time_offset_sd", "gnss.lever_arm", "gnss.lever_arm_sd", "mag.",
     "surface.body_height", "surface.body_height_sd", "surface.lever_arm", "surface.lever_arm_sd",
-    "surface.interval", "jump.event_margin", "initial.", "iteration.")
+    "surface.interval", "rest.", "jump.event_margin", "initial.", "iteration.")
 
 
 @dataclass(frozen=True)
@@ -262,6 +282,7 @@ class SmootherParams(Parameters):
     gap: Gap = Gap()
     gnss: Gnss = Gnss()
     mag: Mag = Mag()
+    rest: AtRest = AtRest()
     surface: SurfaceContact = SurfaceContact()
     jump: Jump = Jump()
     initial: Initial = Initial()
@@ -281,7 +302,8 @@ class SmootherParams(Parameters):
     def idle(self) -> dict[str, str]:
         if self.method == "extended_rts":
             return dict.fromkeys(_NOT_IN_THE_PAPER, "with method 'extended_rts'")
-        idle = {}
+        idle = {} if self.rest.found else dict.fromkeys(
+            ("rest.shortest", "rest.velocity_sd"), "without rest.found")
         for group, of in (("gnss", self.gnss), ("mag", self.mag)):
             if of.loss == "squared":
                 idle[f"{group}.loss_scale"] = f"with {group}.loss 'squared'"

@@ -37,6 +37,10 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
     if result.converged is False:
         yield (f"the smoother did not converge in {result.iterations} iterations: take its "
                "result as provisional")
+    if result.left_out and result.start_found:
+        yield (f"the recording begins in motion, and initial.speed_sd says that the body rests: "
+               f"the first {result.left_out} Imu samples, before its last rest, are left out "
+               "(initial.start chooses another start)")
     yield from _on_missing_imu(result)
     yield from _on_lost_turns(result)
     yield from _on_stamps(result)

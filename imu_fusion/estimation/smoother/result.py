@@ -9,6 +9,7 @@ from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.jump_result import JumpResult
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.remarks import remarks_on
+from imu_fusion.estimation.smoother.rests import Rest
 from imu_fusion.estimation.smoother.surface_fit import SurfaceFit
 from imu_fusion.geometry.geodesy import LocalFrame
 
@@ -98,6 +99,8 @@ class SmootherResult:
     ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
+    ``left_out``: number of Imu samples before the start; ``start_found``: whether that was found.
+    ``rests``: at which the velocity was taken for zero.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
     """
 
@@ -124,6 +127,9 @@ class SmootherResult:
     stands: bool = True
     late: dict[str, float] = field(default_factory=dict)
     lost_turns: tuple[int, ...] = ()
+    rests: tuple[Rest, ...] = ()
+    left_out: int = 0
+    start_found: bool = False
     failure: str = ""
     log_likelihood: float = -np.inf
 

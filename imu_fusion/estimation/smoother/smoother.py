@@ -9,6 +9,7 @@ from imu_fusion.estimation.smoother.attempt import Attempt, Given, Model, attemp
 from imu_fusion.estimation.smoother.extended_rts import ExtendedRts
 from imu_fusion.estimation.smoother.gnss_lag import find_lags
 from imu_fusion.estimation.smoother.hypotheses import likelier
+from imu_fusion.estimation.smoother.imu_input import from_start
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.receiver_alone import smooth_receiver
@@ -54,7 +55,7 @@ class Smoother:
         if self.params.method == "extended_rts":
             return ExtendedRts(self.params, self.surface).run(imu, mag, fix, velocity, events,
                                                               initial_quat)
-        mag = _calibrated(mag, self.params)
+        mag, whole, imu = _calibrated(mag, self.params), len(imu), from_start(imu, self.params)
         given, model = Given(imu, mag, fix, velocity, events, initial_quat), Model(self.params)
         found, lags = self._smooth_and_time(given, model)
         further = lags[1] - lags[0]
@@ -74,7 +75,8 @@ class Smoother:
                 if name in states:
                     states[name] = states[name][0] + lag, states[name][1]
             result = replace(result, gnss_lag=lags[0], velocity_lag=further, states=states)
-        return result
+        return replace(result, left_out=whole - len(imu),
+                       start_found=self.params.initial.start is None)
 
     def _smooth_and_time(self, given: Given, model: Model
                          ) -> tuple[Attempt | None, tuple[float, float]]:

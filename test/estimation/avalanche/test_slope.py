@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from imu_fusion.errors import EstimationError, LayoutError
 from imu_fusion.estimation.avalanche.field_check import check_field
 from imu_fusion.estimation.avalanche.slope import fall_line, rotation_vectors, slope_axes, turns
-from imu_fusion.estimation.avalanche.start import find_motion
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import ImuLog
+from imu_fusion.samples.motion_span import find_motion
 from imu_fusion.surfaces.plane import Plane
 
 ORIGIN = LocalFrame(46.7486, 9.9451, 2600.0)

@@ -208,3 +208,12 @@ def test_a_delay_that_is_not_given_is_part_of_the_covariance_while_turning():
         distance = np.einsum("ni,nij,nj->n", error, np.linalg.inv(rows["cov_attitude"]), error)
         shares[name] = (distance[fast] < 14.16).mean()    # 3 sigma of three degrees of freedom
     assert shares["unset"] > 0.99 and shares["given"] > 0.99 and shares["wrong"] < 0.9
+
+
+@pytest.mark.parametrize("norm, least, most", [(9.83, 0.2, 0.6), (10.10, 1.0, 2.5)])
+def test_a_force_that_is_not_gravitys_size_at_rest_doubts_the_vertical(norm, least, most):
+    """0.3 m/s^2 of bias along up are as likely across: 1.7 deg."""
+    stamp = np.arange(300, dtype=np.int64) * 10_000_000
+    rows = make({}).run(ImuLog(stamp, np.zeros((300, 3)), np.tile([0.0, 0.0, norm], (300, 1))))
+    tilt = np.degrees(np.sqrt(rows["cov_attitude"][-1, 0, 0]))
+    assert least < tilt < most

@@ -48,6 +48,14 @@ def test_a_clock_that_jumps_ahead_starts_anew(recording, changes):
     assert errors_deg(rows, truth)[first + 2000:].max() < bound
 
 
+def test_what_is_known_of_the_gyroscope_outlives_the_gap(recording):
+    """Begun anew in motion a bias would be known within 0.01 rad/s, as at the start."""
+    imu, mag, _, first = recording
+    row = make({}).run(imu, mag)[first]
+    off = np.abs(row["gyr_bias"] - NOISY.gyr_bias)
+    assert (row["gyr_bias_sd"] < 0.003).all() and (off < 3.0 * row["gyr_bias_sd"]).all()
+
+
 @pytest.mark.parametrize("changes", [dict(), dict(lag=0.5), dict(method="gyro_mag")])
 def test_stream_batch_and_pieces_are_the_same(recording, changes):
     imu, mag, _, first = recording

@@ -32,7 +32,8 @@ FIELD = np.array([1.0, 20.0, -43.0])
 #: Largest deviation that is left out on purpose, for rates of 1 rad/s and forces of 10 m/s^2.
 #: Readings: what the attitude changes of the Earth's rate, 7e-5 rad/s times a lever of 0.1 m or
 #: 47 uT times tau; the Coriolis force is as small.
-NEGLECTED = {"fix": 1e-5, "velocity": 1e-5, "mag": 2.4e-5, "moved_fix": 1e-5}
+NEGLECTED = {"fix": 1e-5, "velocity": 1e-5, "mag": 2.4e-5, "moved_fix": 1e-5,
+             "rest": 1e-5}
 
 
 def left_out_of_fix(h, tau, step, interval, x):

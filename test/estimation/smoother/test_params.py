@@ -64,6 +64,7 @@ CHANGED = {
     "initial.attitude_sd": (0.1, {}),
     "sensor.mag_offset": ((1e-6, 2e-6, 0.0), {}),
     "sensor.mag_matrix": ((1.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), {}),
+    "initial.start": (0.05, {}),
     "initial.position": ((47.4, 10.28, 900.0), {}),
     "initial.position_sd": (2.0, {}),
     "initial.speed_sd": (1.0, {}),
@@ -71,11 +72,13 @@ CHANGED = {
     "iteration.tolerance": (1e-6, {"iteration.cost_tolerance": 0.0}),
     "iteration.cost_tolerance": (100.0, {}),
 }
+#: This recording has no rest: see test_rests.
+OF_RESTS = {"rest.found", "rest.shortest", "rest.velocity_sd"}
 METHODS = ("iterated", "extended_rts")
 
 
 def test_no_parameter_is_left_out():
-    assert {"method", *CHANGED} == {info.name for info in SmootherParams.infos()}
+    assert {"method", *CHANGED, *OF_RESTS} == {info.name for info in SmootherParams.infos()}
     assert set(SmootherParams.OLD_NAMES.values()) <= set(CHANGED)
 
 

@@ -122,6 +122,14 @@ def judge_anchor(s, p):
 
 
 @njit
+def doubt_first_needle(s, p):
+    """Let a heading that begins in motion have the variance of what places are known to do."""
+    if not s.is_anchored:
+        place = _place_variance(s, p) * (s.anchor[0] ** 2 + s.anchor[1] ** 2 + s.anchor[2] ** 2)
+        s.heading_var = min(s.heading_var + place, es.UNIFORM_VARIANCE)
+
+
+@njit
 def _place_variance(s, p):
     """Variance of what the place of the first needle added to it, beyond what is usual: what places
     are found to do, and at first what the hypothesis expects of them."""

@@ -1,5 +1,7 @@
 """All measurements of the smoother: the one place that lists them."""
 
+from typing import Any
+
 import numpy as np
 
 from imu_fusion.estimation.smoother.measurements import (
@@ -7,17 +9,17 @@ from imu_fusion.estimation.smoother.measurements import (
     gnss_moved_fix,
     gnss_velocity,
     magnetometer,
+    rest,
 )
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.records import READING
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.kernels import njit
-from imu_fusion.samples.logs import Log
 
 #: Kinds of readings are indices into this.
 MEASUREMENTS = (gnss_fix.MEASUREMENT, gnss_velocity.MEASUREMENT, magnetometer.MEASUREMENT,
-                gnss_moved_fix.MEASUREMENT)
-FIX, VELOCITY, MAG, MOVED_FIX = range(len(MEASUREMENTS))
+                gnss_moved_fix.MEASUREMENT, rest.MEASUREMENT)
+FIX, VELOCITY, MAG, MOVED_FIX, REST = range(len(MEASUREMENTS))
 
 #: Name -> kind.
 KINDS = {m.name: kind for kind, m in enumerate(MEASUREMENTS)}
@@ -45,14 +47,16 @@ def predict(kind, x, tau, step, model, rows):
         magnetometer.predict(x, tau, step, model, rows)
     elif kind == MOVED_FIX:
         gnss_moved_fix.predict(x, tau, step, model, rows)
+    elif kind == REST:
+        rest.predict(x, tau, step, model, rows)
 
 
-def prepare_readings(logs: dict[str, Log | None], frame: LocalFrame, params: SmootherParams
+def prepare_readings(logs: dict[str, Any], frame: LocalFrame, params: SmootherParams
                      ) -> np.ndarray:
     """Readings (m,) of records.READING that are fit for use, of all measurements in turn.
 
     Args:
-        logs: by the name of the measurement; None: no such sensor.
+        logs: by the name of the measurement, what it prepares; None: no such sensor.
 
     Raises:
         SampleError: covariances or stamps that cannot be.

@@ -33,13 +33,14 @@ _STANDARD_GRAVITY = 9.80665
 class MotionSpan:
     """First sample of the motion, first of the rest after it (its end where there is none), and
     the rest before it as samples [rest_start, start); gyr_bias (3,) rad/s and force (3,) m/s^2,
-    its means."""
+    its means; ``begins_recording``: whether the recording begins with that rest."""
 
     rest_start: int
     start: int
     stop: int
     gyr_bias: np.ndarray
     force: np.ndarray
+    begins_recording: bool = False
 
 
 def find_motion(imu: ImuLog) -> MotionSpan:
@@ -84,7 +85,24 @@ def find_motion(imu: ImuLog) -> MotionSpan:
         stop = _spin_ends(time, imu.gyr - imu.gyr[rest].mean(axis=0), begin,
                           begin + int(slow[-1]) + 1 if len(slow) else begin, end)
     return MotionSpan(level.start, start, stop, imu.gyr[level].mean(axis=0),
-                      imu.acc[level].mean(axis=0))
+                      imu.acc[level].mean(axis=0), rest_start <= width)
+
+
+def last_rest(imu: ImuLog, duration: float) -> int:
+    """The sample from which on ``duration`` s of rest precede the most violent motion; 0 where the
+    recording begins with that rest, or shows none."""
+    good = np.flatnonzero(np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1))
+    imu = imu[good]
+    if len(imu) < 2:
+        return 0
+    try:
+        motion = find_motion(imu)
+    except EstimationError:
+        return 0
+    if motion.begins_recording:
+        return 0
+    begin = int(np.searchsorted(imu.stamp, imu.stamp[motion.start] - round(duration * 1e9)))
+    return int(good[max(begin, motion.rest_start)])
 
 
 def _spin_ends(time, rate, first, stop, end):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from imu_fusion.estimation.avalanche.start import find_motion
 from imu_fusion.samples.logs import ImuLog
+from imu_fusion.samples.motion_span import find_motion
 
 STOP, REST_RATE = 20.0, 0.02    # s, rad/s
 
