@@ -28,6 +28,7 @@ _EPOCH = 1_700_000_000_000_000_000    # ns: the World Magnetic Model knows this 
 
 def _orientation() -> None:
     from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+    from imu_fusion.samples.flat_tops import GYRO_FLOOR, flat_tops
 
     imu, mag = _logs()
     # Both methods are one kernel.
@@ -41,6 +42,8 @@ def _orientation() -> None:
                 estimator.add_mag(int(mag.stamp[i]), mag.mag[i])
                 estimator.add_imu(int(imu.stamp[i]), imu.gyr[i], imu.acc[i])
             estimator.finish()
+    # What looks at recordings before they are estimated.
+    flat_tops(np.clip(3.0 * imu.gyr, -2.0, 2.0), GYRO_FLOOR)
     _orientation_messages(imu, mag)
 
 

@@ -15,8 +15,8 @@ _MOVED = 2.0      # or m/s^2 by which another axis of an accelerometer must chan
 
 def check_standing(imu: ImuLog, name: str) -> list[Finding]:
     """A finding each about the gyroscope and the accelerometer, if axes of it stand still for long
-    while gravity turns; none where it turns as the gyroscope says: a body that is simulated without
-    noise may turn about one or two axes alone."""
+    while gravity turns; none where it turns exactly as the gyroscope says, or about the one axis
+    that the gyroscope knows: a body that is simulated without noise may turn about few axes."""
     known = np.isfinite(imu.gyr).all(axis=1) & np.isfinite(imu.acc).all(axis=1)
     gyr, acc = imu.gyr[known], imu.acc[known]
     if len(gyr) < _FEWEST or not gyr.any() or not acc.any():
@@ -27,8 +27,9 @@ def check_standing(imu: ImuLog, name: str) -> list[Finding]:
         stands = [(axis, found) for axis in range(3)
                   if (found := _longest_stand(values[:, axis])) is not None]
         stands = [(axis, part) for axis, part in stands
-                  if (_turned(acc[part]) > _TURNED if values is gyr else
-                      _moved(np.delete(acc[part], axis, axis=1)) > _MOVED)
+                  if (_turned(acc[part], _changing(gyr[part])) > _TURNED if values is gyr else
+                      set(_changing(gyr[part])) - {axis}
+                      and _moved(np.delete(acc[part], axis, axis=1)) > _MOVED)
                   and not gravity_follows(imu.stamp[known][part], gyr[part], acc[part])]
         if stands:
             part = stands[0][1]
@@ -58,10 +59,19 @@ def _longest_stand(column):
     return slice(first, first + length)
 
 
-def _turned(acc):
-    """By how much (rad) directions turn, of means over tenths of (n, 3)."""
+def _changing(values):
+    """Axes of (n, 3) that do not stand still. A body that is simulated without noise may turn about
+    one alone: then the rates about the others, and its part of gravity, rightly stand."""
+    return np.flatnonzero(np.ptp(values, axis=0))
+
+
+def _turned(acc, about):
+    """By how much (rad) directions turn, of means over tenths of (n, 3); where the body turns about
+    a single axis (``about``), by how much more than that explains."""
     means = np.array([part.mean(axis=0) for part in np.array_split(acc, 10)])
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+    if len(about) == 1:
+        return float(np.ptp(np.arccos(np.clip(means[:, about[0]], -1.0, 1.0))))
     return float(np.arccos(np.clip((means @ means.T).min(), -1.0, 1.0)))
 
 

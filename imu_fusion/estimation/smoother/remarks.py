@@ -88,8 +88,6 @@ def _on_stamps(result):
                f"{'late' if lag > 0 else 'early'} against those of the Imu, as turns and forces "
                f"tell{leap}; they were taken so much {'earlier' if lag > 0 else 'later'}. Correct "
                "the recording, or see that both clocks are one")
-
-
     for name, lag in result.late.items():
         what, other = _SENSORS[name], _SENSORS["gyr" if name == "mag" else "mag"]
         yield (f"{what} are {abs(lag) * 1e3:.0f} ms {'late' if lag > 0.0 else 'early'} against "
@@ -207,8 +205,6 @@ def _on_flight(result):
     if "jump.event_margin" in result.adapted:
         yield ("the first second of the landing stands off the profile, and what follows does not: "
                "a deep landing; heights of that second are left out (jump.event_margin)")
-
-
     if not result.stands:
         beside = float(np.median(result.surface["landing"].residual))
         yield (f"after the touch-down the sensor is {abs(beside):.1f} m "
