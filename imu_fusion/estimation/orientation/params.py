@@ -153,9 +153,9 @@ class FusionParams(Parameters):
             "first. Raise the second near iron.")
     gyro_factor: tuple[float, ...] = param(
         (1.0, 5.0), low=1e-3, high=1e3, length=(1, 2),
-        doc="By how much sensor.gyro_bias_sd and sensor.gyro_scale_sd are larger than stated. Two "
-            "values are two hypotheses, each with each of the local field; gyro_mag takes the "
-            "first. Set it to 1 for a gyroscope that was calibrated.")
+        doc="By how much sensor.gyro_bias_sd, sensor.gyro_bias_walk and sensor.gyro_scale_sd are "
+            "larger than stated. Two values are two hypotheses, each with each of the local "
+            "field; gyro_mag takes the first. Set it to 1 for a gyroscope that was calibrated.")
     lasting_acc_sd: float = param(
         1.0, unit="m/s^2", low=0, high=100,
         doc="Acceleration that lasts in the sensor's axes, as in turns of vehicles and walkers: "
@@ -345,7 +345,8 @@ def _hypothesis(params: OrientationParams, local_field_sd: float, gyro_factor: f
     noise = _VIBRATION if lasting_acc_sd > 0.0 else 1.0
     params = replace(params, sensor=replace(
         s, gyro_noise_density=noise * s.gyro_noise_density,
-        gyro_bias_sd=gyro_factor * s.gyro_bias_sd, gyro_scale_sd=gyro_factor * s.gyro_scale_sd))
+        gyro_bias_sd=gyro_factor * s.gyro_bias_sd,
+        gyro_bias_walk=gyro_factor * s.gyro_bias_walk, gyro_scale_sd=gyro_factor * s.gyro_scale_sd))
     with_acc = params.method == "fusion"
     return record(
         params,
