@@ -6,16 +6,18 @@ one sensor, taken together, are further off than chance makes them, all that is 
 by as much, and is widened (Birge 1932).
 """
 
+import math
+
 from imu_fusion.estimation.acceleration_field.motion_model import BIAS
 from imu_fusion.kernels import njit
 
-_CHANCE = 2.0   # mean square of a sensor's constants, in their variances, that is no misfit
+_CHANCE = 3.0   # standard deviations of a mean square that is no misfit
 
 
 @njit
 def widening(x, channels):
     """Factor on all covariances, by the mean x (N,) of a state with CHANNELs (m,)."""
-    worst, squares, number = _CHANCE, 0.0, 0
+    excess, squares, number = 0.0, 0.0, 0
     for c in range(len(channels)):
         channel = channels[c]
         is_first = c == 0 or channels[c - 1].sensor != channel.sensor
@@ -36,6 +38,15 @@ def widening(x, channels):
                 if channel.shift >= 0:
                     squares += (x[channel.shift + i] / channel.position_sd) ** 2
                     number += 1
-        if c == len(channels) - 1 or channels[c + 1].sensor != channel.sensor:
-            worst = max(worst, squares / max(number, 1))
-    return 1.0 + worst - _CHANCE
+        is_last = c == len(channels) - 1 or channels[c + 1].sensor != channel.sensor
+        if is_last and number > 0:
+            excess = max(excess, squares / number - _by_chance(number))
+    return 1.0 + excess
+
+
+@njit
+def _by_chance(number):
+    """Mean square of so many constants, in their variances, that chance hardly exceeds (Wilson and
+    Hilferty 1931)."""
+    spread = 2.0 / (9.0 * number)
+    return (1.0 - spread + _CHANCE * math.sqrt(spread)) ** 3

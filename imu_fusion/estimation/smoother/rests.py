@@ -59,7 +59,7 @@ def contradicted(rests: Sequence[Rest], at: np.ndarray, innovations: np.ndarray,
     """
     sizes = np.linalg.norm(innovations, axis=1)
     for k, rest in enumerate(rests):
-        if sizes[(at >= rest.first) & (at <= rest.last)].max() > _SDS:
+        if sizes[(at >= rest.first) & (at <= rest.last)].max(initial=0.0) > _SDS:
             before = rests[max(k - 1, 0)]
             if (k == 1 and begins) or rest.unrest > _CLEARLY * before.unrest:
                 return (rest,)
