@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.estimation.orientation import world_turn
 from imu_fusion.geometry.rotation import (
-    quat_exp,
     quat_multiply,
     quat_rotate,
     quat_rotate_inverse,
@@ -176,16 +176,7 @@ def _fix_heading(s, p, z):
     known = horizontal >= _HORIZONTAL_SHARE * norm
     # The needle points to azimuth D: east sin D, north cos D.
     angle = 0.5 * math.pi - p.declination - math.atan2(z[1], z[0]) if known else 0.0
-    turn = quat_exp((0.0, 0.0, angle), 1.0)
-    s.quat_world_imu[:] = quat_multiply(turn, s.quat_world_imu)
-    s.velocity[:] = quat_rotate(turn, s.velocity)
-    s.position[:] = quat_rotate(turn, s.position)
-    cov = s.cov
-    for group in (es.ATTITUDE, es.VELOCITY, es.POSITION):
-        for j in range(es.N):
-            cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j])
-        for j in range(es.N):
-            cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3])
+    turn = world_turn.turn_world(s, angle)
     # The sensor may be moving: what it shows now is no anchor.
     start_field(s, p, quat_rotate(turn, z), known, 1.0 if known else 0.0)
 
@@ -295,18 +286,14 @@ def _innovation(cov, error, rows, variance):
     for i in range(3):
         row = rows[i]
         residual[i] = row.residual
+        spread = es.spread_of(cov, row, es.N)
         for a in range(_COLUMNS):
             residual[i] -= row.coefficient[a] * error[row.index[a]]
         for j in range(i + 1):
             other = rows[j]
             total[i, j] = variance if i == j else 0.0
             for b in range(_COLUMNS):
-                if other.coefficient[b] != 0.0:
-                    line = cov[other.index[b]]
-                    part = 0.0
-                    for a in range(_COLUMNS):
-                        part += row.coefficient[a] * line[row.index[a]]
-                    total[i, j] += other.coefficient[b] * part
+                total[i, j] += other.coefficient[b] * spread[other.index[b]]
     distance = 0.0
     log_det = 0.0
     # Cholesky's factor in place, and the residual through it.
