@@ -2,7 +2,8 @@
 
     python -m benchmarks.orientation_sets [--quick] [--trials] [SET ...]
 
-``--quick`` takes two recordings of each set, ``--trials`` prints every recording. Parameters are
+``--quick`` takes two recordings of each set and writes nothing, ``--trials`` prints every
+recording; of sets that are named only their lines in the tables are written anew. Parameters are
 the defaults everywhere, also the peers'.
 
 **Time.** An estimate at stamp t is the attitude at t, and a rate is the rate at its stamp:
@@ -25,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from vqf import VQF, offlineVQF
 
 from benchmarks.data import broad_trials, data_path, load_broad
-from benchmarks.table import write_table
+from benchmarks.table import lines_of_last_run, write_table
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.evaluation.orientation_error import split_angles
 from imu_fusion.recordings.bag_reader import open_bag
@@ -149,7 +150,8 @@ def _still(folder, corrected=False):
     for path in sorted(data_path(folder).glob("*")):
         imu, mag = _read(path)
         reference, mask = _vertical(imu, corrected)
-        yield Recording(f"{folder} {path.stem}", imu, mag, reference, mask, "tilt")
+        name = f"{folder} {path.stem}" + " less its bias" * corrected
+        yield Recording(name, imu, mag, reference, mask, "tilt")
 
 
 def _read(path):
@@ -379,6 +381,12 @@ HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "
           "trials > 25 % worse"]
 
 
+def _in_order(rows):
+    """Rows of sets or recordings in the order of SETS; of recordings as they come."""
+    order = list(SETS)
+    return sorted(rows, key=lambda row: order.index(row[0]) if row[0] in order else 0)
+
+
 def main(arguments):
     quick, trials = "--quick" in arguments, "--trials" in arguments
     chosen = [a for a in arguments if not a.startswith("--")] or list(SETS)
@@ -392,10 +400,15 @@ def main(arguments):
             if trials:
                 print(trial_line(r.name, scores[-1]), flush=True)
         rows += summary(name, scores) if scores else []
-    if quick or chosen != list(SETS):
+    if quick:
         for row in rows + named:
             print(" | ".join(row))
         return
+    if chosen != list(SETS):
+        tried = {row[0] for row in rows} | {r.name for name in chosen for r in SETS[name]()}
+        rows, named = (_in_order([row for row in lines_of_last_run(table) if row[0] not in tried]
+                                 + new) for table, new in (("orientation_sets", rows),
+                                                           ("orientation_worst", named)))
     write_table("orientation_worst", ["recording", "mode", "peer, deg",
                                       "ours: total / inclination / heading", "within 3 sigma",
                                       "most of it"],

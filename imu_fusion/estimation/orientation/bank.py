@@ -15,7 +15,6 @@ import numpy as np
 from imu_fusion.estimation.orientation import error_state as es
 from imu_fusion.estimation.orientation import fusion, hard_iron
 from imu_fusion.estimation.orientation.rows import FLAG_NO_HEADING, ORIENTATION_DTYPE
-from imu_fusion.estimation.orientation.world_turn import face_alike
 from imu_fusion.geometry.rotation import (
     quat_conjugate,
     quat_exp,
@@ -63,8 +62,6 @@ def step(state, par, stamp, sample, row):
     if result > 0:
         weight = weights(state, par)
         mix(rows, weight, doubts(state, par, weight), row)
-        if result == 2 and state[0].field_norm == 0.0:
-            face_alike(state[:used], likeliest(weight))
     _look_for_iron(state, par, used)
     return result
 

@@ -37,9 +37,9 @@ def remarks(state: np.ndarray, par: np.ndarray, realigned: int, blind: bool = Fa
         found.append(
             "the gyroscope's scale is off by "
             + ", ".join(f"{round(-100.0 * value)}" for value in scale)
-            + " % (x, y, z), far more than stated: until that was found, for some 10 s after motion "
-            "began, estimates are further off than they state; calibrate it (imu_fusion calibrate gyroscope) or raise "
-            "sensor.gyro_scale_sd")
+            + " % (x, y, z), far more than stated: until that was found, for some 10 s after "
+            "motion began, estimates are further off than they state; calibrate it (imu_fusion "
+            "calibrate gyroscope) or raise sensor.gyro_scale_sd")
     iron = state["hard_iron"]
     if iron["found"]:
         found.append(

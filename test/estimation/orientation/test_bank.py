@@ -205,18 +205,3 @@ def test_a_doubt_is_part_of_the_covariance_alone():
     cov = mixed["cov_attitude"][0] - 1e-4 * np.eye(3)
     assert np.trace(cov) == pytest.approx(0.5 * 0.02 ** 2, rel=1e-3)
     assert cov[2, 2] < 1e-9
-
-
-def test_without_a_field_no_change_of_hypothesis_turns_the_heading():
-    """All face alike: which one is the likeliest then decides the tilt alone."""
-    imu, _, _, _ = simulate(Tumbling(seed=3), 6.0, rate=100.0, sensors=NOISY, seed=3)
-    estimator = make({})
-    before = estimator.run(imu[:500])[-1]
-    quat = estimator._state["quat_world_imu"]
-    quat[1:] = (Rotation.from_rotvec([0.0, 0.0, 1.0]) * Rotation.from_quat(quat[1:])).as_quat()
-    after = estimator.run(imu[500:])
-    apart = Rotation.from_quat(estimator._state["quat_world_imu"][:3])
-    assert np.abs((apart * apart[0].inv()).as_rotvec()[:, 2]).max() < 1e-3
-    step = (Rotation.from_quat(after["quat_world_imu"][0])
-            * Rotation.from_quat(before["quat_world_imu"]).inv()).magnitude()
-    assert step < 2.0 * 0.01 * np.linalg.norm(imu.gyr[499:502], axis=1).max()

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from imu_fusion.estimation.orientation import error_state as es
-from imu_fusion.estimation.orientation import world_turn
 from imu_fusion.geometry.rotation import (
+    quat_exp,
     quat_multiply,
     quat_rotate,
     quat_rotate_inverse,
@@ -176,7 +176,16 @@ def _fix_heading(s, p, z):
     known = horizontal >= _HORIZONTAL_SHARE * norm
     # The needle points to azimuth D: east sin D, north cos D.
     angle = 0.5 * math.pi - p.declination - math.atan2(z[1], z[0]) if known else 0.0
-    turn = world_turn.turn_world(s, angle)
+    turn = quat_exp((0.0, 0.0, angle), 1.0)
+    s.quat_world_imu[:] = quat_multiply(turn, s.quat_world_imu)
+    s.velocity[:] = quat_rotate(turn, s.velocity)
+    s.position[:] = quat_rotate(turn, s.position)
+    cov = s.cov
+    for group in (es.ATTITUDE, es.VELOCITY, es.POSITION):
+        for j in range(es.N):
+            cov[group:group + 3, j] = quat_rotate(turn, cov[group:group + 3, j])
+        for j in range(es.N):
+            cov[j, group:group + 3] = quat_rotate(turn, cov[j, group:group + 3])
     # The sensor may be moving: what it shows now is no anchor.
     start_field(s, p, quat_rotate(turn, z), known, 1.0 if known else 0.0)
 
