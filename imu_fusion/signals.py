@@ -89,3 +89,21 @@ def interrupt(number: int, frame: FrameType | None = None) -> None:
     """The handler that raises :class:`Interrupted` wherever the program is."""
     came.append(number)
     raise Interrupted(number)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Within, these signals raise :class:`Interrupted`, and it arrives as that.
+
+    An extension module in whose initialisation a signal comes makes an ImportError of it.
+    """
+    try:
+        with handled(interrupt):
+            yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, Interrupted):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise Interrupted(came[0]) from error
