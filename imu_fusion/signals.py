@@ -95,15 +95,22 @@ def interrupt(number: int, frame: FrameType | None = None) -> None:
 def interruptible() -> Iterator[None]:
     """Within, these signals raise :class:`Interrupted`, and it arrives as that.
 
-    An extension module in whose initialisation a signal comes makes an ImportError of it.
+    Where one comes into an import, an extension module makes an ImportError of it, or a module
+    stays half made and what uses it fails.
     """
     try:
         with handled(interrupt):
             yield
     except Exception as error:
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, Interrupted):
-            cause = cause.__cause__
-        if cause is None:
-            raise
-        raise Interrupted(came[0]) from error
+        if came and _is_of_an_import(error):
+            raise Interrupted(came[0]) from error
+        raise
+
+
+def _is_of_an_import(error):
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        trace = trace.tb_next
+    return False
