@@ -39,7 +39,7 @@ from imu_fusion.streams.stream import EstimatorNodeParams
 from imu_fusion.surfaces.file import load_surface
 
 PRESET = Path(__file__).parent.parent / "config" / "avalanche.yaml"
-SEEDS, WHOLE_SEEDS = 50, 6
+SEEDS, WHOLE_SEEDS = 50, 12
 END = 8.99            # s, where the paper ends, before the gap
 FIX_SD = 0.2          # m, of fixes averaged over minutes
 TERRAIN_SD = 5.0      # m, of a start that is a point of the terrain
