@@ -15,7 +15,9 @@ _FEWEST = 60         # tops of an axis that tell what is mixed into it
 _PRECISE = 2e-3      # standard deviation of an entry of the matrix that counts as told
 _MOST = 0.1          # of an entry: no calibration mixes more
 _EXACT = 2e-3        # of the limit: what a fit of tops that were clipped leaves
-_STILL = 3e-3        # of how much the other axis moves: an axis that stands still
+_MOVES, _SHARE = 0.01, 0.2    # of the limit, by which an axis moves in a share of the tops: what
+                             # moves in a few alone tells whether those are tops, not how it mixes
+_ALONE = 0.1         # of a direction: the share of an axis that moves with another
 _ROUNDS = 4          # the other axes are mixed, too
 _TRIMS = 6
 
@@ -71,22 +73,27 @@ def _row(gyr, seen, i, limit):
     for _ in range(_TRIMS):
         # Samples just below the limit are among them: most are tops, and those fit exactly.
         inside = sides & kept[:, None]
-        means = inside.T @ others / np.maximum(inside.sum(axis=0), 1)[:, None]
-        moved = others - sides @ means
-        scale = np.sqrt(np.sum(moved[kept] ** 2, axis=0))
-        moved[:, scale < _STILL * scale.max()] = 0.0
-        columns = np.column_stack([sides, moved])
+        count = np.maximum(inside.sum(axis=0), 1)
+        moved = others - sides @ (inside.T @ others / count[:, None])
+        _, sizes, directions = np.linalg.svd(moved[kept], full_matrices=False)
+        moves = sizes > _MOVES * limit * np.sqrt(kept.sum())
+        along = moved @ directions[moves].T
+        columns = np.column_stack([sides, along])
         fit = np.linalg.lstsq(columns[kept], gyr[near[kept], i], rcond=None)[0]
         off = np.abs(gyr[near, i] - columns @ fit)
         kept = off <= max(3.0 * float(np.median(off)), 0.1 * _EXACT * limit)
-    exact = off <= _EXACT * limit
-    if exact.sum() < max(_FEWEST, len(near) // 2) or np.abs(fit[2:]).max() > _MOST:
+    exact, told = off <= _EXACT * limit, directions[moves]
+    if (exact.sum() < max(_FEWEST, len(near) // 2) or not moves.any()
+            or np.abs(fit[2:] @ told).max() > _MOST):
         return None, tops
     scatter = max(float(np.sqrt(np.mean(off[exact] ** 2))), 0.05 * _EXACT * limit)
-    spread = np.linalg.pinv(np.cov(moved[exact].T)).diagonal() / exact.sum()
-    if not moved.any() or not (scatter * np.sqrt(spread) < _PRECISE).all():
+    if not (scatter < _PRECISE * sizes[moves]).all():
         return None, tops
     tops[near[exact]] = True
+    often = np.quantile(np.abs(along[exact]), 1.0 - _SHARE, axis=0) > _MOVES * limit
+    told, fit = told[often], fit[2:][often]
+    if not often.any() or (len(told) == 1 and np.abs(told).min() > _ALONE):
+        return None, tops    # or two that move together
     row = np.zeros(3)
-    row[[i, j, k]] = 1.0, fit[2], fit[3]
+    row[[i, j, k]] = 1.0, *(fit @ told)
     return row, tops
