@@ -80,8 +80,10 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if chosen is other and _left(tried.result) <= max(1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
-    if model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations:
-        # A smooth path hardly contradicts fixes that are late by seconds.
+    if (model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations
+            and len(found.result.innovations.get("fix", ((),))[0]) >= _FEWEST):
+        # A smooth path hardly contradicts fixes that are late by seconds. Those of its ends alone
+        # would be free of either.
         for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
             found, model = _try(found, model, other, smooth)
     # Readings in a row far beside the trajectory are no noise either.
