@@ -40,7 +40,8 @@ from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import FOLLOWS, likeliest, near_ground
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
+from imu_fusion.samples.centre import find_centre
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog, seconds
 from imu_fusion.surfaces.constraint import Surface, split_sigma
 from imu_fusion.surfaces.hill import PARTS, Hill
 
@@ -48,6 +49,7 @@ from imu_fusion.surfaces.hill import PARTS, Hill
 _STARTS = 4          # first attitudes tried until one fits
 _MOVES = 3.0         # standard deviations of a speed that is no rest
 _LIES = 1.0          # m, from the height of a sensor that stands to that of one that lies
+_OFF_CENTRE, _CENTRE_SD = 5.0, 0.003    # standard deviations; m, by scales of accelerometers
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
@@ -327,6 +329,19 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
                           residuals=residuals, wander=wander, near_ground=near, failure=failure,
-                          lost_turns=tuple(problem.lost_turns),
+                          lost_turns=tuple(problem.lost_turns), centre=other_centre(problem),
                           log_likelihood=log_density(problem.readings)
                           - solution.last.surprise)
+
+
+def other_centre(problem: Problem) -> np.ndarray | None:
+    """Where a tumbling body's centre is, if that is not where the surface is said to hold it."""
+    surface = problem.params.surface
+    if surface.lever_arm_sd or not any(c.phase == "always" for c in problem.constraints):
+        return None
+    log = problem.imu.log
+    found = find_centre(seconds(log.stamp, log.stamp[0]), log.acc, log.gyr)
+    if found is None:
+        return None
+    off = np.abs(found.point - surface.lever_arm)
+    return found.point if np.any(off > _OFF_CENTRE * np.hypot(found.sd, _CENTRE_SD)) else None

@@ -86,7 +86,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if chosen is other and _left(tried.result) <= max(1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
-    if model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations:
+    if (model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations
+            and len(found.result.innovations.get("fix", ((),))[0]) >= _FEWEST):
         found, model = _late_fixes(found, model, smooth)
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
@@ -110,7 +111,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
 
 
 def _late_fixes(found, model, smooth):
-    """With fixes alone that are late: a smooth path hardly contradicts seconds of that."""
+    """With fixes alone that are late: a smooth path hardly contradicts seconds of that. Those of
+    its ends alone would be free of either."""
     for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
         if abs(_lateness(found)) > _PERHAPS:
             found, model = _try(found, model, other, smooth)

@@ -43,6 +43,7 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
                "(initial.start chooses another start)")
     yield from _on_missing_imu(result)
     yield from _on_lost_turns(result)
+    yield from _on_centre(result)
     yield from _on_stamps(result)
     yield from _on_repeats(result)
     yield from _on_step(result)
@@ -73,6 +74,15 @@ def _on_lost_turns(result):
                "follows about as well the likeliest is taken, and attitude and trajectory from "
                "there on may be wrong by more than is stated; more fixes, or a surface known "
                "better, tell")
+
+
+def _on_centre(result):
+    if result.centre is not None:
+        there = ", ".join(f"{v:.3f}" for v in result.centre)
+        yield (f"the body tumbles about a point [{there}] m from the accelerometers, which is not "
+               "surface.lever_arm, as the forces at high rates tell: flights are not seen for what "
+               "they are, and the surface holds the wrong point. Put it there, and into "
+               "gnss.lever_arm where the antenna is in the centre")
 
 
 def _on_stamps(result):

@@ -101,6 +101,8 @@ class SmootherResult:
     ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
+    ``centre``: (3,) m from the accelerometers, of a tumbling body whose surface.lever_arm is
+    another; None: it is not.
     ``left_out``: number of Imu samples before the start; ``start_found``: whether that was found.
     ``rests``: at which the velocity was taken for zero.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
@@ -130,6 +132,7 @@ class SmootherResult:
     profile: ProfileError = ProfileError()
     late: dict[str, float] = field(default_factory=dict)
     lost_turns: tuple[int, ...] = ()
+    centre: np.ndarray | None = None
     rests: tuple[Rest, ...] = ()
     left_out: int = 0
     start_found: bool = False
