@@ -27,24 +27,23 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.problem import Problem, log_density
+from imu_fusion.estimation.smoother.profile_fit import ProfileError
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS
 from imu_fusion.estimation.smoother.rests import Rest, contradicted, find_rests, stamps_of
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.sensor_lag import in_time
 from imu_fusion.estimation.smoother.state import StatePrior
-from imu_fusion.estimation.smoother.surface_fit import (
-    misfit_at_landing,
-    surface_fits,
-)
+from imu_fusion.estimation.smoother.surface_fit import misfit_at_landing, surface_fits
+from imu_fusion.estimation.smoother.surface_place import fixes_beside, widen_place
 from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import FOLLOWS, likeliest, near_ground
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.centre import find_centre
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog, seconds
-from imu_fusion.surfaces.constraint import Surface
-from imu_fusion.surfaces.hill import Hill
+from imu_fusion.surfaces.constraint import Surface, split_sigma
+from imu_fusion.surfaces.hill import PARTS, Hill
 
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
@@ -80,7 +79,8 @@ class Model(NamedTuple):
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
     standard deviations; ``repeats``: whether readings of the receiver that are the one before
     exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
-    sensor is at its height above the profile; ``late``: "gyr" or "mag" -> s, by which these are
+    sensor is at its height above the profile; ``profile``: an error of the landing profile, which
+    counts as much less as that is beyond chance; ``late``: "gyr" or "mag" -> s, by which these are
     later than the accelerometer; ``rests``; None: those that the recording shows."""
 
     params: SmootherParams
@@ -90,6 +90,7 @@ class Model(NamedTuple):
     stands: bool = True
     late: Mapping[str, float] = {}
     rests: tuple[Rest, ...] | None = None
+    profile: ProfileError = ProfileError()
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -117,6 +118,9 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     constraints = surface.constraints() if surface is not None else ()
     if not model.stands:
         constraints = _lying(constraints, prepared.log, params)
+    elif model.profile.sds:
+        constraints = tuple(c if c.phase != "landing" else replace(
+            c, sigma=c.sigma * abs(model.profile.sds)) for c in constraints)
     events = given.events
     detected = events is None and any(c.phase != "always" for c in constraints)
     if detected:
@@ -126,10 +130,13 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     if rests is None:
         rests = find_rests(prepared, given.fix, given.velocity, frame, params) if given.felt else ()
     while True:
-        found = _attempt(given, model, surface, constraints, prepared, frame, events, detected,
-                         rests)
+        found = _attempt(given, model, surface, constraints, prepared, frame, first, events,
+                         detected, rests)
         refuted = () if model.rests is not None else _refuted(found, rests)
         if not refuted:
+            if surface is not None:
+                widen_place(found.result.samples, surface.constraints(),
+                            max(1.0, abs(model.profile.sds)), *_fixes_beside(found))
             return found._replace(result=replace(found.result, rests=rests))
         rests = tuple(rest for rest in rests if rest not in refuted)
 
@@ -145,10 +152,9 @@ def _refuted(found, rests):
                         bool(begins))
 
 
-def _attempt(given, model, surface, constraints, prepared, frame, events, detected, rests):
+def _attempt(given, model, surface, constraints, prepared, frame, first, events, detected, rests):
     """Under the assumption of rests."""
     params = model.params
-    first = first_place(given.fix, params.initial.position)
     readings = _readings(given, model, frame, stamps_of(rests, prepared.log.stamp))
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
     around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
@@ -267,6 +273,18 @@ def _from_attitude(problem, frame, hill, quat, events):
     return Attempt(own, _result(own, frame, hill, solution))
 
 
+def _fixes_beside(found):
+    """Offset (3,) m of the fixes from a trajectory, and its standard deviation (3,)."""
+    residuals = found.result.residuals.get("fix")
+    if residuals is None:
+        return np.zeros(3), np.full(3, np.inf)
+    readings = found.problem.readings
+    whiten = readings["whiten"][readings["kind"] == KINDS["fix"]]
+    unit = np.median(1.0 / np.diagonal(whiten, axis1=1, axis2=2), axis=0)
+    sds, sd = fixes_beside(residuals, found.result.wander["fix"])
+    return unit * sds, unit * sd
+
+
 def _positions(problem: Problem) -> np.ndarray:
     samples = np.empty(len(problem.x), SAMPLE)
     samples["stamp"] = problem.imu.log.stamp
@@ -301,7 +319,8 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
         near = near_ground(samples, states, solution.events, problem.constraints, problem.params)
         try:
             jump = jump_result(hill, at_surface(samples, states, problem.params),
-                               problem.imu.log, solution.events, misfit_at_landing(fits))
+                               problem.imu.log, solution.events, misfit_at_landing(fits),
+                               split_sigma(hill.sigma, PARTS)["landing"])
             if near > FOLLOWS:
                 jump = replace(jump, length_sd=float(np.hypot(
                     jump.length_sd, near * jump.landing_speed)))

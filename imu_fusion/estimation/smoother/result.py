@@ -8,6 +8,7 @@ from imu_fusion.estimation.smoother.gnss_step import GnssStep
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.jump_result import JumpResult
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.profile_fit import ProfileError
 from imu_fusion.estimation.smoother.remarks import remarks_on
 from imu_fusion.estimation.smoother.rests import Rest
 from imu_fusion.estimation.smoother.surface_fit import SurfaceFit
@@ -95,7 +96,8 @@ class SmootherResult:
     ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
     or below it.
     ``stands``: whether the sensor is at its height above the profile after a touch-down; False:
-    these heights hardly count.
+    these heights hardly count. ``profile``: an error of the landing profile that the readings show,
+    which counts less for it.
     ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
@@ -127,6 +129,7 @@ class SmootherResult:
     acc_density: float | None = None
     near_ground: float = 0.0
     stands: bool = True
+    profile: ProfileError = ProfileError()
     late: dict[str, float] = field(default_factory=dict)
     lost_turns: tuple[int, ...] = ()
     centre: np.ndarray | None = None
