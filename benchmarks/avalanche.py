@@ -135,7 +135,7 @@ def rms(values):
 def recovered(ball):
     """The ball's Imu with its rates recovered, as the preset does it."""
     return recover(ball.log.imu, ball.log.mag, recovery_params(
-        preset((SmoothingParams, SmootherNodeParams), "smoother").replace(**ball.known)))
+        preset((SmoothingParams, SmootherNodeParams), "smoother").replace(**ball.known))).imu
 
 
 def fixes(ball, part, count):

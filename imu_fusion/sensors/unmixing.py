@@ -15,8 +15,9 @@ _FEWEST = 60         # tops of an axis that tell what is mixed into it
 _PRECISE = 2e-3      # standard deviation of an entry of the matrix that counts as told
 _MOST = 0.1          # of an entry: no calibration mixes more
 _EXACT = 2e-3        # of the limit: what a fit of tops that were clipped leaves
-_MOVES, _SHARE = 0.01, 0.2    # of the limit, by which an axis moves in a share of the tops: what
-                             # moves in a few alone tells whether those are tops, not how it mixes
+# What moves in a few tops alone tells whether they are tops, not how it mixes: of the limit, and in
+# which share of them.
+_MOVES, _SHARE = 0.01, 0.2
 _ALONE = 0.1         # of a direction: the share of an axis that moves with another
 _ROUNDS = 4          # the other axes are mixed, too
 _TRIMS = 6
