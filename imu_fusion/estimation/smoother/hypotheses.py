@@ -21,7 +21,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 )
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.problem import log_density
-from imu_fusion.estimation.smoother.profile_fit import profile_error
+from imu_fusion.estimation.smoother.profile_fit import profile_error, widened_by_profile
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.sensor_lag import field_lag
@@ -41,7 +41,8 @@ _LAG_TRIES = 3       # what turns to and fro within a lag tells only a part of i
 _FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
 _SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
 _BESIDE = 0.3        # m from the profile: as near as a contact is told to be
-_OTHER_PROFILE = 4.0   # standard deviations of an error of a profile that is no chance
+_OTHER_PROFILE = 3.5   # standard deviations of an error of a profile that is no chance
+_DOUBTED_PROFILE = 2.0   # and of one that hardly is
 _MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
@@ -176,13 +177,15 @@ def _fall(found, model, smooth):
 def _other_profile(found, model, smooth):
     """With a landing profile that counts as much less as an error of it is beyond chance; not
     compared by likelihood, as that of the error itself is the evidence: as far as fixes do not
-    wander."""
+    wander. One that may be chance widens what is stated."""
     events = found.result.events
     if found.result.jump is None or not model.stands or contradicted(found.result):
         return found, model
     error = profile_error(found.problem, events)
-    if abs(error.sds) < _OTHER_PROFILE * found.result.wander.get("fix", 1.0):
-        return found, model
+    sds = abs(error.sds) / found.result.wander.get("fix", 1.0)
+    if sds < _OTHER_PROFILE:
+        return (found if sds < _DOUBTED_PROFILE else found._replace(
+            result=widened_by_profile(found.result, error))), model
     other = model._replace(profile=error)
     tried = _smoothed(other, smooth)
     if tried is None or tried.result.jump is None:

@@ -4,12 +4,16 @@ Its heights hold a trajectory so firmly that a profile that is off takes the tra
 deviations that are left are small. What an error of a given shape would explain tells it.
 """
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.problem import Problem
+
+if TYPE_CHECKING:
+    from imu_fusion.estimation.smoother.result import SmootherResult
 
 _GROWS = 1.5     # s after touch-down, in which an error grows that is none there: other radii
 _JUDGED = 4_000_000_000    # ns after touch-down, by which it is judged
@@ -42,3 +46,12 @@ def profile_error(problem: Problem, events: JumpEvents) -> ProfileError:
     found = [ProfileError(*problem.shift(size, contacts=shape, first=first, last=last))
              for shape in shapes]
     return max(found, key=lambda error: abs(error.sds))
+
+
+def widened_by_profile(result: "SmootherResult", error: ProfileError) -> "SmootherResult":
+    """A result of a jump whose length and heights are less certain by an error of the profile."""
+    assert result.jump is not None
+    samples = result.samples.copy()
+    samples["cov_position"][:, 2, 2] += error.metres ** 2
+    return replace(result, samples=samples, jump=replace(
+        result.jump, length_sd=float(np.hypot(result.jump.length_sd, error.metres))))

@@ -13,6 +13,7 @@ from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.measurements.surface_contact import evaluate_constraints
 from imu_fusion.estimation.smoother.params import Gnss, SurfaceContact
+from imu_fusion.estimation.smoother.profile_fit import ProfileError, widened_by_profile
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.estimation.smoother.surface_place import fixes_beside, widen_place
@@ -76,6 +77,14 @@ def test_a_landing_of_another_radius_is_said_and_counts_less(jump, recording, ra
     assert ("too small" if radius > 1.0 else "too large") in text
     assert 0.2 < abs(result.profile.metres) < 0.6
     assert abs(result.jump.length - jump.length) < 3 * result.jump.length_sd < 1.0
+
+
+def test_an_error_of_the_profile_that_may_be_chance_widens_what_is_stated(result):
+    wider = widened_by_profile(result, ProfileError(-0.3, -2.5))
+    up, before = (r.samples["cov_position"][:, 2, 2] for r in (wider, result))
+    np.testing.assert_allclose(up - before, 0.09)
+    assert wider.jump.length_sd == pytest.approx(np.hypot(result.jump.length_sd, 0.3))
+    assert wider.jump.length == result.jump.length and wider.remarks() == []
 
 
 def test_a_surface_is_placed_no_better_than_it_says_and_fixes_show():
