@@ -105,6 +105,7 @@ INPUT_ROWS = [
               lambda imu, mag, rng: (with_imu(imu, imu.gyr * 30.0 / np.pi), mag)),
     input_row("gyroscope 0.1 s late", "silent", late),
     input_row("gyroscope 0.1 s late, turning in place", "silent", late, travel_sd=0.01),
+    input_row("gyroscope 0.1 s late, no magnetometer", "silent", late, with_mag=False),
     input_row("gyroscope of another body", "silent", of_another_body),
     input_row("gyroscope sticks half way", "silent", sticks([0, 1, 2])),
     input_row("z of the gyroscope sticks half way", "silent", sticks([2])),
