@@ -4,8 +4,8 @@
 
 Every row is a situation with known truth, simulated with 20 seeds. Says where an estimate is off by
 more than three stated standard deviations, in the mean over a run, and nothing was said. With
-arguments, only those rows of the table are run and replaced. Without, and as PART Smoother, the situations of :mod:`benchmarks.smoother_misfits` come, too, in
-their own table.
+arguments, only those rows of the table are run and replaced. Without, and as PART Smoother, the
+situations of :mod:`benchmarks.smoother_misfits` come, too, in their own table.
 """
 
 import re

@@ -102,10 +102,10 @@ def start_remarks(adaptation: np.ndarray, initial: Initial) -> list[str]:
     if initial.mode == "rest":    # with a gyroscope
         return []
     size, axes = np.linalg.eigh(information)
-    known = size > _SURELY ** 2
-    off = axes[:, known] @ (axes[:, known].T @ score / size[known])
-    length = float(np.linalg.norm(off))
-    spread = np.sqrt(off @ axes[:, known] @ np.diag(1.0 / size[known]) @ axes[:, known].T @ off)
+    told = size > _SURELY ** 2
+    size, axes = size[told], axes[:, told]
+    off = axes @ (axes.T @ score / size)
+    length, spread = float(np.linalg.norm(off)), np.sqrt(np.sum((axes.T @ off) ** 2 / size))
     if length * length > max(_SLOW * length, _SURELY * spread):
         text = ", ".join(f"{value:.1f}" for value in off)
         return [f"the motion says that the body turned by some ({text}) rad/s more than "
