@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from vqf import VQF, offlineVQF
 
 from benchmarks.data import broad_errors, broad_trials, load_broad
-from benchmarks.table import RESULTS, write_table
+from benchmarks.table import lines_of_last_run, write_table
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.samples.logs import ImuLog, MagLog
 
@@ -124,9 +124,7 @@ def leave_one_out(errors):
 
 def peers_of_last_run():
     """The table's lines of peers as the last whole run wrote them."""
-    lines = (RESULTS / "orientation_broad.md").read_text().splitlines()
-    cells = [line[2:-2].split(" | ") for line in lines if line.startswith("| ")][1:]
-    return [row for row in cells if not row[0].startswith(("fusion", "gyro_mag"))]
+    return [row for row in lines_of_last_run("orientation_broad") if not row[0].startswith(("fusion", "gyro_mag"))]
 
 
 def main(only_ours=False):

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.orientation_sets import SETS, WORSE, peers, score
-from benchmarks.table import RESULTS, write_table
+from benchmarks.table import lines_of_last_run, write_table
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.samples.logs import ImuLog, MagLog
 
@@ -360,7 +360,8 @@ def main(arguments):
                          f"{np.mean([mine.within for mine, _, _ in group]):.2f}", str(sum(worse)),
                          str(sum(silent)), str(sum(a and b for a, b in zip(worse, silent)))])
             print(" | ".join(rows[-1]), flush=True)
-    kept = {} if chosen == list(CHANGES) else _lines_of_last_run()
+    kept = {} if chosen == list(CHANGES) else {
+        tuple(row[:3:2]): row for row in lines_of_last_run("orientation_changed")}
     kept |= {tuple(row[:3:2]): row for row in rows}
     write_table("orientation_changed", HEADER, [
         kept[change, mode] for change in CHANGES for mode in ("causal", "smoothed")
@@ -368,13 +369,6 @@ def main(arguments):
         note=f"Peers: VQF (causal) and OfflineVQF (smoothed), vqf {version('vqf')}. Total error, "
              "mean over the trials; the ratio is the geometric mean of theirs. Silent: fewer "
              f"than {_MANY} of the rows within 3 sigma and no remark.")
-
-
-def _lines_of_last_run():
-    """Rows of the table as they are, by change and mode."""
-    lines = (RESULTS / "orientation_changed.md").read_text().splitlines()
-    rows = [line[2:-2].split(" | ") for line in lines if line.startswith("| ")][1:]
-    return {tuple(row[:3:2]): row for row in rows}
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
     python -m benchmarks.orientation_sets [--quick] [--trials] [SET ...]
 
-``--quick`` takes two recordings of each set, ``--trials`` prints every recording. Parameters are
+``--quick`` takes two recordings of each set and writes nothing, ``--trials`` prints every
+recording; of sets that are named only their lines in the tables are written anew. Parameters are
 the defaults everywhere, also the peers'.
 
 **Time.** An estimate at stamp t is the attitude at t, and a rate is the rate at its stamp:
@@ -25,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from vqf import VQF, offlineVQF
 
 from benchmarks.data import broad_trials, data_path, load_broad
-from benchmarks.table import write_table
+from benchmarks.table import lines_of_last_run, write_table
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.evaluation.orientation_error import split_angles
 from imu_fusion.recordings.bag_reader import open_bag
@@ -42,6 +43,9 @@ _TURN_ROWS = 20          # over which turns show how a body is mounted
 _FIT_ROUNDS = 100
 _STILL_RATE, _STILL_FORCE = 0.05, 0.2   # rad/s, m/s^2: largest standard deviations at rest
 _STILL_SIZE = 0.03       # of the force's norm, by which it may differ from the usual one at rest
+_GRAVITY = 9.807         # m/s^2
+_FORCE_BIAS_SD = 0.1     # m/s^2, of an accelerometer before its sizes are looked at
+_SIZE_SD = 0.02          # m/s^2, of a rest, that a bias leaves
 _FAST = ("06", "08", "21", "28")
 
 
@@ -140,12 +144,14 @@ def _near_jumps(imu, reference):
     return near
 
 
-def _still(folder):
-    """Recordings without a reference: where they lie still, the force shows the vertical."""
+def _still(folder, corrected=False):
+    """Recordings without a reference: where they lie still, the force shows the vertical, less the
+    accelerometer's bias if corrected."""
     for path in sorted(data_path(folder).glob("*")):
         imu, mag = _read(path)
-        reference, mask = _vertical(imu)
-        yield Recording(f"{folder} {path.stem}", imu, mag, reference, mask, "tilt")
+        reference, mask = _vertical(imu, corrected)
+        name = f"{folder} {path.stem}" + " less its bias" * corrected
+        yield Recording(name, imu, mag, reference, mask, "tilt")
 
 
 def _read(path):
@@ -160,10 +166,10 @@ def _read(path):
             MagLog(stamp, d[:, 7:10] * 1e-6))
 
 
-def _vertical(imu):
+def _vertical(imu, corrected):
     """(n, 4) attitudes, of any heading, whose z is along the force, and mask (n,) of the rows within
     a second in which rate and force stay the same and the force has the size that it has on average
-    when they do."""
+    when they do. corrected: less the bias that the sizes of the forces show."""
     half = int(0.5 * len(imu) / ((imu.stamp[-1] - imu.stamp[0]) * 1e-9))
     around = np.lib.stride_tricks.sliding_window_view(np.hstack([imu.gyr, imu.acc]), 2 * half + 1,
                                                       axis=0)
@@ -175,12 +181,24 @@ def _vertical(imu):
     still[half:-half] &= np.abs(size / usual - 1.0) < _STILL_SIZE
     reference = np.full((len(imu), 4), np.nan)
     up = mean[still[half:-half], 3:]
+    if corrected:
+        rests = np.split(up, np.flatnonzero(np.diff(np.flatnonzero(still)) > 1) + 1)
+        up = up - _force_bias(np.array([rest.mean(axis=0) for rest in rests]))
     cross = np.cross(up, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(cross, axis=1), up[:, 2])
     axis = cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-9)[:, None]
     axis[np.linalg.norm(cross, axis=1) < 1e-9] = [1.0, 0.0, 0.0]
     reference[still] = Rotation.from_rotvec(angle[:, None] * axis).as_quat()
     return reference, still
+
+
+def _force_bias(force):
+    """Bias (3,) of an accelerometer whose mean forces (n, 3) of rests should all have gravity's size: no
+    estimate of an attitude is in it. Zero along axes that never point up or down."""
+    size = np.linalg.norm(force, axis=1)
+    shown = force / size[:, None]
+    prior = (_SIZE_SD / _FORCE_BIAS_SD) ** 2 * np.eye(3)
+    return np.linalg.solve(shown.T @ shown + prior, shown.T @ (size - _GRAVITY))
 
 
 SETS = {
@@ -194,6 +212,7 @@ SETS = {
     "OpenAXES, no magnetometer": lambda: _npz("openaxes"),
     "ros1, force at rest": lambda: _still("ros1"),
     "x-io, force at rest": lambda: _still("xio"),
+    "x-io, force at rest less its bias": lambda: _still("xio", corrected=True),
 }
 """Name of the set to a function of its Recordings; nothing where the data is not at hand."""
 
@@ -362,6 +381,12 @@ HEADER = ["set", "trials", "mode", "peer: total / inclination / heading, deg", "
           "trials > 25 % worse"]
 
 
+def _in_order(rows):
+    """Rows of sets or recordings in the order of SETS; of recordings as they come."""
+    order = list(SETS)
+    return sorted(rows, key=lambda row: order.index(row[0]) if row[0] in order else 0)
+
+
 def main(arguments):
     quick, trials = "--quick" in arguments, "--trials" in arguments
     chosen = [a for a in arguments if not a.startswith("--")] or list(SETS)
@@ -375,10 +400,15 @@ def main(arguments):
             if trials:
                 print(trial_line(r.name, scores[-1]), flush=True)
         rows += summary(name, scores) if scores else []
-    if quick or chosen != list(SETS):
+    if quick:
         for row in rows + named:
             print(" | ".join(row))
         return
+    if chosen != list(SETS):
+        tried = {row[0] for row in rows} | {r.name for name in chosen for r in SETS[name]()}
+        rows, named = (_in_order([row for row in lines_of_last_run(table) if row[0] not in tried]
+                                 + new) for table, new in (("orientation_sets", rows),
+                                                           ("orientation_worst", named)))
     write_table("orientation_worst", ["recording", "mode", "peer, deg",
                                       "ours: total / inclination / heading", "within 3 sigma",
                                       "most of it"],

@@ -18,3 +18,9 @@ def write_table(name, header, rows, note=""):
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.md").write_text(text)
     print(text)
+
+
+def lines_of_last_run(name):
+    """Cells of the rows of ``benchmarks/results/<name>.md``, without its header."""
+    lines = (RESULTS / f"{name}.md").read_text().splitlines()
+    return [line[2:-2].split(" | ") for line in lines if line.startswith("| ")][1:]

@@ -89,3 +89,28 @@ def interrupt(number: int, frame: FrameType | None = None) -> None:
     """The handler that raises :class:`Interrupted` wherever the program is."""
     came.append(number)
     raise Interrupted(number)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Within, these signals raise :class:`Interrupted`, and it arrives as that.
+
+    Where one comes into an import, an extension module makes an ImportError of it, or a module
+    stays half made and what uses it fails.
+    """
+    try:
+        with handled(interrupt):
+            yield
+    except Exception as error:
+        if came and _is_of_an_import(error):
+            raise Interrupted(came[0]) from error
+        raise
+
+
+def _is_of_an_import(error):
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        trace = trace.tb_next
+    return False

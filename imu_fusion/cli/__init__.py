@@ -13,7 +13,7 @@ import click
 import imu_fusion
 from imu_fusion.cli import calibrations, estimates, files, nodes
 from imu_fusion.cli.common import Group
-from imu_fusion.signals import Interrupted, handled, interrupt
+from imu_fusion.signals import Interrupted, interruptible
 
 
 @click.group(cls=Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -38,7 +38,7 @@ for command in (
 def main() -> None:
     """Entry point of the console script."""
     try:
-        with handled(interrupt):
+        with interruptible():
             cli(prog_name="imu_fusion")
     except Interrupted as signal:
         sys.exit(signal.code)

@@ -45,10 +45,10 @@ NODES = {
 
 def main(args: Sequence[str] | None = None, name: str = "") -> int:
     """Entry point of every executable: start the node that has its name; returns the exit code."""
-    from imu_fusion.signals import Interrupted, came, end_with_parent, handled, interrupt
+    from imu_fusion.signals import Interrupted, came, end_with_parent, interruptible
     name = name or Path(sys.argv[0]).stem
     try:
-        with handled(interrupt):    # from here on: importing takes a second
+        with interruptible():    # from here on: importing takes a second
             end_with_parent()
             module = importlib.import_module(f"imu_fusion.nodes.{name}")
             base = importlib.import_module("imu_fusion.nodes.base")

@@ -7,14 +7,11 @@ from typing import Any
 import numpy as np
 
 from imu_fusion.errors import ParameterError
-from imu_fusion.estimation.orientation.estimator import (
-    UNITS,
-    OrientationEstimator,
-    OrientationParams,
-)
+from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation.lost_turn import LOST, is_blind, unseen_turn
 from imu_fusion.estimation.orientation.mag_screen import MagScreen
 from imu_fusion.estimation.orientation.rows import ORIENTATION_DTYPE
+from imu_fusion.estimation.orientation.summary import UNITS
 from imu_fusion.geometry.magnetic_field import decimal_year, declination
 from imu_fusion.messages.convert import GYROSCOPE_FIRST, SAMPLE_TYPES
 from imu_fusion.messages.layouts import FIX, MAG

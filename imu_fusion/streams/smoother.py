@@ -177,9 +177,10 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
         return Smoother(params, surface).run(imu, mag, fix, velocity)
     begun = from_start(imu, params)
     known = params.replace(**{"sensor.gyro_range": None, "initial.start": None})
-    result = Smoother(known, surface).run(recover(begun, mag, recovery_params(params)), mag, fix,
-                                          velocity)
-    return replace(result, left_out=len(imu) - len(begun),
+    found = recover(begun, mag, recovery_params(params))
+    result = Smoother(known, surface).run(found.imu, found.mag, fix, velocity)
+    late = {**result.late, "mag": found.mag_lag} if found.mag_lag else result.late
+    return replace(result, left_out=len(imu) - len(begun), late=late,
                    start_found=params.initial.start is None)
 
 

@@ -184,6 +184,8 @@ def _mix_attitude(rows, weight, doubt, best, row):
     off = np.empty((len(rows), 3))
     mean = np.zeros(3)
     for k in range(len(rows)):
+        if weight[k] + doubt[k] == 0.0:
+            continue
         if doubt[k] > 0.0 or rows[best].flags & FLAG_NO_HEADING:
             apart = _leaned(rows[best].quat_world_imu, rows[k].quat_world_imu)
         else:
@@ -193,6 +195,8 @@ def _mix_attitude(rows, weight, doubt, best, row):
             mean[i] += weight[k] * apart[i]
     cov = np.zeros((3, 3))
     for k in range(len(rows)):
+        if weight[k] + doubt[k] == 0.0:
+            continue
         # From the axes of this row to those of the mean.
         r = quat_to_matrix(quat_exp((off[k, 0] - mean[0], off[k, 1] - mean[1],
                                      off[k, 2] - mean[2]), 1.0))

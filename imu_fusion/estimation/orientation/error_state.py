@@ -281,6 +281,19 @@ def _record(tape, row, spread, total, innovation):
 
 
 @njit
+def spread_of(cov, row, states):
+    """Covariance (N,) of the error state with what a ROW measures."""
+    spread = np.zeros(N)
+    for a in range(row.count):
+        c = row.coefficient[a]
+        if c != 0.0:
+            line = cov[row.index[a]]
+            for i in range(states):
+                spread[i] += c * line[i]
+    return spread
+
+
+@njit
 def update(cov, error, states, row, tape):
     """One scalar measurement of the error state, in place.
 
@@ -298,13 +311,7 @@ def update(cov, error, states, row, tape):
         IndexError: the tape is full: MAX_UPDATES is less than the measurements of a block.
     """
     count = row.count
-    spread = np.zeros(N)
-    for a in range(count):
-        c = row.coefficient[a]
-        if c != 0.0:
-            line = cov[row.index[a]]
-            for i in range(states):
-                spread[i] += c * line[i]
+    spread = spread_of(cov, row, states)
     total = row.variance
     innovation = row.residual
     for a in range(count):

@@ -5,7 +5,6 @@ orientation from it and then hands every sample to a compiled kernel. A sample a
 time or a whole log at once, the same kernel runs in the same order.
 """
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_fusion.errors import EstimationError, ParameterError, SampleError
-from imu_fusion.estimation.orientation import bank, hard_iron, kernel, remarks
+from imu_fusion.estimation.orientation import bank, hard_iron, kernel, remarks, summary
 from imu_fusion.estimation.orientation.alignment import (
     Alignment,
     align,
@@ -34,15 +33,6 @@ from imu_fusion.estimation.orientation.rows import FLAG_GAP, ORIENTATION_DTYPE
 from imu_fusion.estimation.orientation.state import COUNT_NAMES, COUNTS, new_state
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_to_rpy
 from imu_fusion.samples.logs import ImuLog, MagLog
-
-UNITS = {
-    "initial_tilt_sd_deg": "deg", "initial_heading_sd_deg": "deg", "inclination_deg": "deg",
-    "field_norm_ut": "uT", "gravity": "m/s^2", "lasting_acc_sd": "m/s^2", "gyro_delay": "s",
-    "mag_delay": "s", **{f"gyr_bias_{axis}": "rad/s" for axis in "xyz"},
-    **{f"initial_quat_{component}": "1" for component in "xyzw"},
-    **dict.fromkeys(("local_field_sd", "gyro_factor", "local_field_weight", "gyro_factor_weight",
-                     "lasting_acc_weight", "wander_tilt", "wander_heading"), "1")}
-"""Units of :meth:`OrientationEstimator.summary`; what is not named here is a count."""
 
 _CHUNK = 256
 _NO_TAPES = np.zeros(0, TAPE)
@@ -278,52 +268,25 @@ class OrientationEstimator:
         return int(self._state["counts"]["mag_saturated"][0] + self._counted["mag_saturated"][0])
 
     def summary(self) -> dict[str, Any]:
-        """Plain numbers and strings for diagnostics, in UNITS.
+        """Plain numbers and strings for diagnostics, in :data:`summary.UNITS`.
 
         Of the hypotheses it is the likeliest: ``local_field_sd``, ``gyro_factor`` and
         ``lasting_acc_sd``, each with the weight of all that agree. ``wander_tilt`` and
         ``wander_heading`` are how many times more than white ones its innovations wander: the
         attitude's standard deviations are widened by what is above 1.
         """
-        weight = bank.weights(self._state, self._par)
-        best = bank.likeliest(weight)
-        s, par, a = self._state[best], self._par[0], self._alignment
-        counts = dict(
-            method=self.params.method, aligned=a is not None,
-            **{name: int(value) for name, value in zip(COUNT_NAMES, self._counts(best)[0])})
-        if a is None:
-            return counts
-        return counts | dict(
-            started_at_rest=a.at_rest, has_heading=bool(s["heading_known"]),
-            **{f"initial_quat_{c}": float(v) for c, v in zip("xyzw", a.quat_world_imu)},
-            initial_tilt_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[0, 0])),
-            initial_heading_sd_deg=math.degrees(math.sqrt(a.cov_attitude_world[2, 2])),
-            local_field_sd=float(self._par[best]["local_field_sd"]),
-            gyro_factor=float(self._par[best]["gyro_factor"]),
-            local_field_weight=self._weight_of("local_field_sd", weight, best),
-            gyro_factor_weight=self._weight_of("gyro_factor", weight, best),
-            lasting_acc_sd=float(self._par[best]["lasting_acc_sd"]),
-            lasting_acc_weight=self._weight_of("lasting_acc_sd", weight, best),
-            **{f"wander_{axis}": math.sqrt(value)
-               for axis, value in zip(("tilt", "heading"), s["wander"]["overall"])},
-            inclination_deg=math.degrees(a.inclination), field_norm_ut=a.field_norm * 1e6,
-            gravity=a.gravity,
-            **{f"gyr_bias_{c}": float(v) for c, v in zip("xyz", s["gyro_bias"])},
-            gyro_delay=float(par["gyro_delay"]),
-            mag_delay=float(par["gyro_delay"] + s["mag_lag"]))
+        return summary.summary(self._state, self._par, self.params.method, self._alignment,
+                               self._counts(self._likeliest())[0])
 
     def remarks(self) -> list[str]:
         """What makes the estimates so far doubtful, and what to do about it."""
         best = self._likeliest()
         blind = self._alignment is not None and is_blind(self.params, self._alignment.at_rest)
-        return remarks.remarks(self._state[best], int(self._counts(best)["realigned"][0]), blind)
+        return remarks.remarks(self._state[best], self._par[best],
+                               int(self._counts(best)["realigned"][0]), blind)
 
     def _likeliest(self):
         return bank.likeliest(bank.weights(self._state, self._par))
-
-    def _weight_of(self, name, weight, best):
-        """Weight of all hypotheses that agree with the likeliest one in a parameter."""
-        return float(weight[self._par[name] == self._par[name][best]].sum())
 
     def _counts(self, hypothesis):
         """Counts of the present stretch, by one hypothesis, and of those before it, (1,) COUNTS."""

@@ -56,11 +56,12 @@ def smooth(state: np.ndarray, par: np.ndarray, stamps: np.ndarray, samples: np.n
               for k in range(len(own))]
     weight = bank.weights(state, par)
     doubt = bank.doubts(state, par, weight)
-    for k in np.flatnonzero(weight + doubt):
+    kept = np.flatnonzero(weight + doubt)
+    for k in kept:
         _smooth(state[k:k + 1], par[k:k + 1], logs, own[k], tapes, passes[k])
     written = int(passes[0][-1][1]["row"][0])
     if used > 1:
-        bank.mix_all(np.stack([part[:written] for part in own]), weight, doubt, rows)
+        bank.mix_all(np.stack([own[k][:written] for k in kept]), weight[kept], doubt[kept], rows)
     return written
 
 

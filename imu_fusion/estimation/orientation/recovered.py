@@ -4,6 +4,9 @@ Winkler 2025 (appendix B) recovers them sample by sample from two differences of
 error-state filter has them as states and solves a burst as a whole, with a covariance.
 """
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 
 from imu_fusion.errors import EstimationError
@@ -15,10 +18,20 @@ from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.sensors.unmixing import unmix
 
 _WILD = 1.1    # limits: nothing that was clipped lies beyond, whatever a calibration mixes
+_LATE = 2e-3   # s: less is what the estimate of a lag errs by
 
 
-def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLog:
-    """The log with recovered rates and their standard deviation ``gyr_sd``.
+class Recovered(NamedTuple):
+    """``imu`` with recovered rates and their standard deviation ``gyr_sd``; ``mag``, earlier by
+    ``mag_lag`` s, where it was that much later than the rates (0: not, or by little)."""
+
+    imu: ImuLog
+    mag: MagLog
+    mag_lag: float
+
+
+def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> Recovered:
+    """Recover rates that were clipped, with their standard deviations.
 
     The errors of a burst go together for as long as the spin remembers its acceleration: n samples
     turn the body by n times the error of one, so that white noise which does as much has sqrt(n)
@@ -45,23 +58,25 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> ImuLo
               else np.broadcast_to(params.sensor.gyro_range, 3))
     tops = unmix(imu.gyr, limits, BAND)
     mixing = tops.matrix - np.eye(3)
-    rows, used = _fused(imu, mag, imu.gyr, tops.clipped, limits, params)
+    rows, used, lag = _fused(imu, mag, imu.gyr, tops.clipped, limits, params)
     if tops.known.any():
         beyond = np.where(tops.clipped[used], rows["gyr"] - tops.seen[used], 0.0)
         mixed = imu.gyr.copy()
         mixed[used] += beyond @ mixing.T
-        rows, used = _fused(imu, mag, mixed, tops.clipped, limits, params)
+        rows, used, lag = _fused(imu, mag, mixed, tops.clipped, limits, params)
     missing = tops.clipped[used]
     recovered = np.where(missing, _in_bursts(rows, missing, params.fusion.angular_acc_time), 0.0)
     mixed_in = recovered @ np.abs(mixing).T
     sd = np.hypot(np.where(missing, recovered, mixed_in),
                   _misaligned(rows, params.sensor.gyro_scale_sd))
-    return ImuLog(rows["stamp"], rows["gyr"], rows["acc"], imu.frame_id, sd)
+    lag = lag if abs(lag) > _LATE else 0.0
+    return Recovered(ImuLog(rows["stamp"], rows["gyr"], rows["acc"], imu.frame_id, sd),
+                     replace(mag, stamp=mag.stamp - np.int64(round(lag * 1e9))), lag)
 
 
 def _fused(imu, mag, gyr, clipped, limits, params):
-    """Rows of the smoothed filter of rates (n, 3) that are ``clipped`` (n, 3), and the indices of
-    the samples that they are of."""
+    """Rows of the smoothed filter of rates (n, 3) that are ``clipped`` (n, 3), the indices of the
+    samples that they are of, and s by which the magnetometer was later."""
     # Flat tops that nothing else reaches, but for wild values: that is how the filter knows them.
     size = np.abs(gyr)
     top = 1.011 * np.where(size < _WILD * limits, size, 0.0).max(axis=0, initial=0.0) + 1e-3
@@ -70,7 +85,8 @@ def _fused(imu, mag, gyr, clipped, limits, params):
         **{"mode": "smoothed", "sensor.gyro_range": tuple(float(v) for v in top)}))
     rows = np.concatenate([estimator.run(ImuLog(imu.stamp, flat, imu.acc), mag),
                            estimator.finish()])
-    return rows, np.searchsorted(imu.stamp, rows["stamp"])
+    return rows, np.searchsorted(imu.stamp, rows["stamp"]), float(
+        estimator.summary().get("mag_delay", 0.0))
 
 
 def _step(rows):

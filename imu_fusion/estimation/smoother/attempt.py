@@ -27,28 +27,29 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.estimation.smoother.points import at_surface
 from imu_fusion.estimation.smoother.problem import Problem, log_density
+from imu_fusion.estimation.smoother.profile_fit import ProfileError
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS
 from imu_fusion.estimation.smoother.rests import Rest, contradicted, find_rests, stamps_of
 from imu_fusion.estimation.smoother.result import SAMPLE, SmootherResult
 from imu_fusion.estimation.smoother.samples import smoothed_samples, smoothed_states
 from imu_fusion.estimation.smoother.sensor_lag import in_time
 from imu_fusion.estimation.smoother.state import StatePrior
-from imu_fusion.estimation.smoother.surface_fit import (
-    misfit_at_landing,
-    surface_fits,
-)
+from imu_fusion.estimation.smoother.surface_fit import misfit_at_landing, surface_fits
+from imu_fusion.estimation.smoother.surface_place import fixes_beside, widen_place
 from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import FOLLOWS, likeliest, near_ground
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog
-from imu_fusion.surfaces.constraint import Surface
-from imu_fusion.surfaces.hill import Hill
+from imu_fusion.samples.centre import find_centre
+from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog, seconds
+from imu_fusion.surfaces.constraint import Surface, split_sigma
+from imu_fusion.surfaces.hill import PARTS, Hill
 
 # A wrong first attitude can end in another minimum: converged or not, fixes then do not fit.
 _STARTS = 4          # first attitudes tried until one fits
 _MOVES = 3.0         # standard deviations of a speed that is no rest
 _LIES = 1.0          # m, from the height of a sensor that stands to that of one that lies
+_OFF_CENTRE, _CENTRE_SD = 5.0, 0.003    # standard deviations; m, by scales of accelerometers
 _PLAUSIBLE = 1.5     # typical innovation of fixes, in standard deviations, that is taken as a fit
 
 
@@ -78,7 +79,8 @@ class Model(NamedTuple):
     fix after a step of all fixes, or None; ``noise``: name of readings -> factor of their stated
     standard deviations; ``repeats``: whether readings of the receiver that are the one before
     exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
-    sensor is at its height above the profile; ``late``: "gyr" or "mag" -> s, by which these are
+    sensor is at its height above the profile; ``profile``: an error of the landing profile, which
+    counts as much less as that is beyond chance; ``late``: "gyr" or "mag" -> s, by which these are
     later than the accelerometer; ``rests``; None: those that the recording shows."""
 
     params: SmootherParams
@@ -88,6 +90,7 @@ class Model(NamedTuple):
     stands: bool = True
     late: Mapping[str, float] = {}
     rests: tuple[Rest, ...] | None = None
+    profile: ProfileError = ProfileError()
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -115,6 +118,9 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     constraints = surface.constraints() if surface is not None else ()
     if not model.stands:
         constraints = _lying(constraints, prepared.log, params)
+    elif model.profile.sds:
+        constraints = tuple(c if c.phase != "landing" else replace(
+            c, sigma=c.sigma * abs(model.profile.sds)) for c in constraints)
     events = given.events
     detected = events is None and any(c.phase != "always" for c in constraints)
     if detected:
@@ -124,10 +130,13 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     if rests is None:
         rests = find_rests(prepared, given.fix, given.velocity, frame, params) if given.felt else ()
     while True:
-        found = _attempt(given, model, surface, constraints, prepared, frame, events, detected,
-                         rests)
+        found = _attempt(given, model, surface, constraints, prepared, frame, first, events,
+                         detected, rests)
         refuted = () if model.rests is not None else _refuted(found, rests)
         if not refuted:
+            if surface is not None:
+                widen_place(found.result.samples, surface.constraints(),
+                            max(1.0, abs(model.profile.sds)), *_fixes_beside(found))
             return found._replace(result=replace(found.result, rests=rests))
         rests = tuple(rest for rest in rests if rest not in refuted)
 
@@ -143,10 +152,9 @@ def _refuted(found, rests):
                         bool(begins))
 
 
-def _attempt(given, model, surface, constraints, prepared, frame, events, detected, rests):
+def _attempt(given, model, surface, constraints, prepared, frame, first, events, detected, rests):
     """Under the assumption of rests."""
     params = model.params
-    first = first_place(given.fix, params.initial.position)
     readings = _readings(given, model, frame, stamps_of(rests, prepared.log.stamp))
     measured = {MEASUREMENTS[kind].name for kind in np.unique(readings["kind"])}
     around = surroundings_of(params, frame, int(prepared.log.stamp[0]), "mag" in measured)
@@ -265,6 +273,18 @@ def _from_attitude(problem, frame, hill, quat, events):
     return Attempt(own, _result(own, frame, hill, solution))
 
 
+def _fixes_beside(found):
+    """Offset (3,) m of the fixes from a trajectory, and its standard deviation (3,)."""
+    residuals = found.result.residuals.get("fix")
+    if residuals is None:
+        return np.zeros(3), np.full(3, np.inf)
+    readings = found.problem.readings
+    whiten = readings["whiten"][readings["kind"] == KINDS["fix"]]
+    unit = np.median(1.0 / np.diagonal(whiten, axis1=1, axis2=2), axis=0)
+    sds, sd = fixes_beside(residuals, found.result.wander["fix"])
+    return unit * sds, unit * sd
+
+
 def _positions(problem: Problem) -> np.ndarray:
     samples = np.empty(len(problem.x), SAMPLE)
     samples["stamp"] = problem.imu.log.stamp
@@ -299,7 +319,8 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
         near = near_ground(samples, states, solution.events, problem.constraints, problem.params)
         try:
             jump = jump_result(hill, at_surface(samples, states, problem.params),
-                               problem.imu.log, solution.events, misfit_at_landing(fits))
+                               problem.imu.log, solution.events, misfit_at_landing(fits),
+                               split_sigma(hill.sigma, PARTS)["landing"])
             if near > FOLLOWS:
                 jump = replace(jump, length_sd=float(np.hypot(
                     jump.length_sd, near * jump.landing_speed)))
@@ -308,6 +329,19 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
                           residuals=residuals, wander=wander, near_ground=near, failure=failure,
-                          lost_turns=tuple(problem.lost_turns),
+                          lost_turns=tuple(problem.lost_turns), centre=other_centre(problem),
                           log_likelihood=log_density(problem.readings)
                           - solution.last.surprise)
+
+
+def other_centre(problem: Problem) -> np.ndarray | None:
+    """Where a tumbling body's centre is, if that is not where the surface is said to hold it."""
+    surface = problem.params.surface
+    if surface.lever_arm_sd or not any(c.phase == "always" for c in problem.constraints):
+        return None
+    log = problem.imu.log
+    found = find_centre(seconds(log.stamp, log.stamp[0]), log.acc, log.gyr)
+    if found is None:
+        return None
+    off = np.abs(found.point - surface.lever_arm)
+    return found.point if np.any(off > _OFF_CENTRE * np.hypot(found.sd, _CENTRE_SD)) else None

@@ -21,9 +21,11 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 )
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.problem import log_density
+from imu_fusion.estimation.smoother.profile_fit import profile_error, widened_by_profile
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.sensor_lag import field_lag
+from imu_fusion.estimation.smoother.state import VEL
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
 from imu_fusion.estimation.smoother.whiteness import correlation, wandering
 
@@ -33,10 +35,14 @@ _LARGE = 1.5         # standard deviations, of typical innovations of the receiv
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
 _LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
+_STEP_OF_DELAY = 0.1   # s, for which its likelihood is taken
+_PERHAPS = 1.0       # standard deviation of a delay that is tried: far from it they err
 _LAG_TRIES = 3       # what turns to and fro within a lag tells only a part of it
 _FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
 _SINKS = 1.0         # s after touch-down, in which a jumper who landed deeply has risen again
 _BESIDE = 0.3        # m from the profile: as near as a contact is told to be
+_OTHER_PROFILE = 3.5   # standard deviations of an error of a profile that is no chance
+_DOUBTED_PROFILE = 2.0   # and of one that hardly is
 _MAD = 1.4826        # standard deviations of a normal distribution in a median deviation
 
 
@@ -67,6 +73,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     model = model._replace(rests=found.result.rests)    # likelihoods are of the same rows
     found, model = _deep_landing(found, model, smooth)
     found, model = _fall(found, model, smooth)
+    found, model = _other_profile(found, model, smooth)
     if contradicted(found.result):
         return _adapted(found, model, given)
     if model.params.maximum_likelihood != "off":
@@ -80,10 +87,9 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
         if chosen is other and _left(tried.result) <= max(1.0, _LEFT * _left(found.result)):
             found, model = tried, other
             break
-    if model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations:
-        # A smooth path hardly contradicts fixes that are late by seconds.
-        for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
-            found, model = _try(found, model, other, smooth)
+    if (model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations
+            and len(found.result.innovations.get("fix", ((),))[0]) >= _FEWEST):
+        found, model = _late_fixes(found, model, smooth)
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
             or _many_outliers(found.result)):
@@ -105,9 +111,28 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     return _adapted(found, model, given)
 
 
+def _late_fixes(found, model, smooth):
+    """With fixes alone that are late: a smooth path hardly contradicts seconds of that. Those of
+    its ends alone would be free of either."""
+    for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
+        if abs(_lateness(found)) > _PERHAPS:
+            found, model = _try(found, model, other, smooth)
+    return found, model
+
+
+def _lateness(found):
+    """Standard deviations by which the delay of the fixes seems not to be zero."""
+    problem = found.problem
+    sample = np.repeat(np.arange(len(problem.x)), np.diff(problem.reading_start))
+    of_fix = np.isin(problem.readings["kind"], (FIX, MOVED_FIX))
+    ahead = np.where(of_fix[:, None], problem.x[sample, VEL:VEL + 3], 0.0)
+    return problem.shift(_STEP_OF_DELAY, readings=ahead)[1]
+
+
 def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), stands=model.stands,
+                   profile=model.profile,
                    late=dict(model.late), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
@@ -121,9 +146,8 @@ def _deep_landing(found, model, smooth):
             or not (is_doubtful(found.result) or fit.first_excess > MOST_FIRST_EXCESS)):
         return found, model
     other = model.changed({"jump.event_margin": _SINKS})
-    try:
-        tried = smooth(other)
-    except EstimationError:
+    tried = _smoothed(other, smooth)
+    if tried is None:
         return found, model
     lands = (tried.result.jump is not None and not is_doubtful(tried.result)
              and stands_at_touch_down(tried.result, tried.problem.constraints, other.params))
@@ -141,14 +165,32 @@ def _fall(found, model, smooth):
             fit.excess > MOST_EXCESS or fit.first_excess > MOST_FIRST_EXCESS):
         return found, model
     other = model._replace(stands=False)
-    try:
-        tried = smooth(other)
-    except EstimationError:
+    tried = _smoothed(other, smooth)
+    if tried is None:
         return found, model
     lies = (tried.result.jump is not None and not is_doubtful(tried.result)
             and stands_at_touch_down(tried.result, tried.problem.constraints, other.params)
             and abs(np.median(tried.result.surface["landing"].residual)) > _BESIDE)
     return (tried, other) if lies else (found, model)
+
+
+def _other_profile(found, model, smooth):
+    """With a landing profile that counts as much less as an error of it is beyond chance; not
+    compared by likelihood, as that of the error itself is the evidence: as far as fixes do not
+    wander. One that may be chance widens what is stated."""
+    events = found.result.events
+    if found.result.jump is None or not model.stands or contradicted(found.result):
+        return found, model
+    error = profile_error(found.problem, events)
+    sds = abs(error.sds) / found.result.wander.get("fix", 1.0)
+    if sds < _OTHER_PROFILE:
+        return (found if sds < _DOUBTED_PROFILE else found._replace(
+            result=widened_by_profile(found.result, error))), model
+    other = model._replace(profile=error)
+    tried = _smoothed(other, smooth)
+    if tried is None or tried.result.jump is None:
+        return found, model
+    return tried, other
 
 
 def _repeated(found, model, smooth):
@@ -158,11 +200,8 @@ def _repeated(found, model, smooth):
     if fits(found.result) and not _many_outliers(found.result):
         return found, model
     other = model._replace(repeats=False)
-    try:
-        tried = smooth(other)
-    except EstimationError:
-        return found, model
-    if not tried.result.repeats or _many_outliers(tried.result):
+    tried = _smoothed(other, smooth)
+    if tried is None or not tried.result.repeats or _many_outliers(tried.result):
         return found, model
     better = fits(tried.result) or _left(tried.result) <= max(1.0, _LEFT * _left(found.result))
     return (tried, other) if better else (found, model)
@@ -186,11 +225,8 @@ def _other_time(found, model, smooth):
             if model.late and name not in model.late:
                 continue
             other = model._replace(late={name: model.late.get(name, 0.0) + more})
-            try:
-                tried = smooth(other)
-            except EstimationError:
-                continue
-            if _gained(tried, best[0]) > 0.0:
+            tried = _smoothed(other, smooth)
+            if tried is not None and _gained(tried, best[0]) > 0.0:
                 best = tried, other
         if best[0] is found:
             break
@@ -209,10 +245,10 @@ def _bent_field(found, model, smooth):
         if excess == 1.0:
             break
         other = model._replace(noise={**model.noise, "mag": excess * model.noise.get("mag", 1.0)})
-        try:
-            found, model = smooth(other), other
-        except EstimationError:
+        tried = _smoothed(other, smooth)
+        if tried is None:
             break
+        found, model = tried, other
     return found, model
 
 
@@ -307,11 +343,18 @@ def _where_zero(model, changes):
 
 def _try(found, model, other, smooth, gain=_GAIN):
     """The attempt and model that are likelier by a gain, else those found."""
-    try:
-        tried = smooth(other)
-    except EstimationError:
+    tried = _smoothed(other, smooth)
+    if tried is None:
         return found, model
     return (tried, other) if _gained(tried, found) > gain else (found, model)
+
+
+def _smoothed(other, smooth):
+    """The Attempt under another model, None where there is none."""
+    try:
+        return smooth(other)
+    except EstimationError:
+        return None
 
 
 def _gained(tried, found):

@@ -11,6 +11,9 @@ from imu_fusion.surfaces.hill import Hill
 
 _IN_RUN = 10.0   # m before the edge, over which light barriers measure the in-run speed
 
+# Of a length by that of the landing's heights: simulated jumps, errors of many shapes.
+_PER_PROFILE = 1.0
+
 
 @dataclass(frozen=True)
 class JumpResult:
@@ -78,11 +81,12 @@ def _in_run_speed(hill, samples, takeoff):
 
 
 def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents,
-                misfit: float = 1.0) -> JumpResult:
+                misfit: float = 1.0, profile_sd: float = 0.0) -> JumpResult:
     """Read the results of a jump off the smoothed samples.
 
     The length is that of the landing profile up to the touch-down; its standard deviation
-    joins the position's along the profile and the date's times the speed. The take-off angle
+    joins the position's along the profile, the date's times the speed, and that of the profile,
+    whose errors are no noise: they are the same for all of a landing. The take-off angle
     is that of the velocity at the edge, upwards positive; the in-run speed is the mean over
     the last 10 m before the edge, as light barriers measure it.
 
@@ -92,6 +96,7 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
         imu: ImuLog.
         events: JumpEvents.
         misfit: factor of the standard deviations at the touch-down.
+        profile_sd: m, of the heights of the landing profile.
 
     Raises:
         EstimationError: the touch-down is not beyond the table.
@@ -112,8 +117,8 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
     slope = float(hill.landing(x)[1])
     forward = hill.axes[0]
     cov_x = np.einsum("i,nij,j->n", forward, samples["cov_position"], forward)
-    length_sd = misfit * np.hypot(1.0, slope) * np.hypot(np.sqrt(cov_x[touch]),
-                                                         timing * (forward @ landing))
+    length_sd = np.hypot(misfit * np.hypot(1.0, slope) * np.hypot(
+        np.sqrt(cov_x[touch]), timing * (forward @ landing)), _PER_PROFILE * profile_sd)
     edge_timing = np.sqrt(cov_x[edge]) / (forward @ takeoff)
     takeoff_speed, landing_speed = np.linalg.norm(takeoff), np.linalg.norm(landing)
     horizontal = np.hypot(*takeoff[:2])

@@ -18,6 +18,8 @@ from imu_fusion.sensors.params import SENSOR
 
 _SENSOR = ("sensor.gyro_noise_density", "sensor.acc_noise_density", "sensor.gyro_bias_walk",
            "sensor.acc_bias_walk")
+# Iron is no noise; a velocity of zero is no reading, and likelier the surer it is said to be.
+_NOT_FITTED = ("mag", "rest")
 _MOST = np.log(20.0)   # of a factor, either way
 _SPREAD = 1.0          # of the logarithm of a factor, before any reading: e or 1/e
 _STEP = 0.1            # of it, between two values whose difference tells the slope
@@ -34,7 +36,8 @@ def fit_noise(problem: Problem, model: Model, held: Collection[str] = ()) -> Mod
         problem: solved under ``model``. held: names of states that wander as they are given to.
     """
     present = np.unique(problem.readings["kind"])
-    names = [MEASUREMENTS[kind].name for kind in present if MEASUREMENTS[kind].name != "mag"]
+    names = [MEASUREMENTS[kind].name for kind in present
+             if MEASUREMENTS[kind].name not in _NOT_FITTED]
     wandering = [block.name for block in BLOCKS
                  if block.tau is not None and getattr(problem.blocks, block.name) >= 0
                  and block.name not in held]

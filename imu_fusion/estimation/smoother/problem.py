@@ -262,6 +262,41 @@ class Problem:
             self.fit.copy(), make_storage(0, 0, n), make_scratch(n))
         return log_density(readings) - surprise
 
+    def shift(self, size: float, readings: np.ndarray | None = None,
+              contacts: np.ndarray | None = None, first: int = 0, last: int | None = None
+              ) -> tuple[float, float]:
+        """How large, in units of ``size``, a shift of rows seems to be, and by how many standard
+        deviations that is not zero: the likelihood, linear about the trajectory, is a parabola in
+        it (score test: Rao 1948).
+
+        Args:
+            size: for which the likelihood is taken.
+            readings: (M, 3) of values, for a shift of one. contacts: (r,) m, likewise.
+            first: sample before which there is no shift. last: sample before which rows count.
+        """
+        n = self.size
+        delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
+        boxminus(self.mean, self.x[0], delta)
+        fit, storage, scratch = self.fit.copy(), make_storage(0, 0, n), make_scratch(n)
+        filter_segment(0, first, False, self.x, delta, cov, self.recording, fit, storage, scratch)
+        found = []
+        for factor in (-size, 0.0, size):
+            shifted = self.recording
+            if readings is not None:
+                shifted = shifted._replace(readings=shifted.readings.copy())
+                shifted.readings["value"] += factor * readings
+            if contacts is not None:
+                shifted = shifted._replace(contacts=shifted.contacts.copy())
+                shifted.contacts["residual"] += factor * contacts
+            found.append(float(filter_segment(
+                first, len(self.x) if last is None else last, False, self.x, delta.copy(),
+                cov.copy(), shifted, fit, storage, scratch)[1]))
+        less, middle, more = found
+        curvature, slope = less + more - 2.0 * middle, 0.5 * (less - more)
+        if not curvature > 0.0:
+            return 0.0, 0.0
+        return size * slope / curvature, slope / float(np.sqrt(curvature))
+
     def _surface_lever(self):
         """Lever arm (3,) or (N, 3) m of the point that is held on the surface."""
         i = self.blocks.surface_lever_arm

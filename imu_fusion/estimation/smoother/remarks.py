@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_fusion.estimation.smoother.measurements.registry import MEASUREMENTS
+from imu_fusion.estimation.smoother.surface_place import fixes_beside
 from imu_fusion.estimation.smoother.touch_down import FOLLOWS
 
 if TYPE_CHECKING:
@@ -22,8 +23,7 @@ _LEAP_SECONDS = 18.0         # s, GPS time ahead of UTC since 2017
 _SILENT = 0.01               # share of the samples
 _OUTLYING = 0.05             # share of the readings
 _RUN = 10                    # outliers in a row: single ones are what the loss is for
-_BESIDE = 5.0                # standard deviations of the median innovation of fixes
-_MEDIAN_SD = 1.2533          # of the median, by that of the mean: sqrt(pi / 2)
+_BESIDE = 4.0                # standard deviations of the mean residual of fixes
 _WANDERS = {
     "fix": "of the receiver: gnss.position_error_sd; a change of datum or antenna",
     "velocity": "of the receiver: gnss.velocity_error_sd",
@@ -43,6 +43,7 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
                "(initial.start chooses another start)")
     yield from _on_missing_imu(result)
     yield from _on_lost_turns(result)
+    yield from _on_centre(result)
     yield from _on_stamps(result)
     yield from _on_repeats(result)
     yield from _on_step(result)
@@ -73,6 +74,15 @@ def _on_lost_turns(result):
                "follows about as well the likeliest is taken, and attitude and trajectory from "
                "there on may be wrong by more than is stated; more fixes, or a surface known "
                "better, tell")
+
+
+def _on_centre(result):
+    if result.centre is not None:
+        there = ", ".join(f"{v:.3f}" for v in result.centre)
+        yield (f"the body tumbles about a point [{there}] m from the accelerometers, which is not "
+               "surface.lever_arm, as the forces at high rates tell: flights are not seen for what "
+               "they are, and the surface holds the wrong point. Put it there, and into "
+               "gnss.lever_arm where the antenna is in the centre")
 
 
 def _on_stamps(result):
@@ -181,16 +191,16 @@ def _on_wander(result):
 
 
 def _on_place(result):
-    """Medians of the normalised innovations of fixes that cannot be chance where a surface holds
-    the trajectory; or the error that was taken, as it can be the surface's as well."""
-    if not result.surface or "fix" not in result.innovations:
+    """Means of the residuals of fixes that cannot be chance where a surface holds the trajectory;
+    or the error that was taken, as it can be the surface's as well."""
+    if not result.surface or "fix" not in result.residuals:
         return
-    values, unit = result.innovations["fix"][1], "of their standard deviations"
-    middle = np.median(values, axis=0)
+    middle, sd = fixes_beside(result.residuals["fix"], result.wander.get("fix", 1.0))
+    unit = "of their standard deviations"
     taken = "gnss.position_error_sd" in result.adapted
     if taken:
         middle, unit = np.median(result.states["gnss_position_error"][0], axis=0), "m"
-    if taken or np.abs(middle).max() > _BESIDE * _MEDIAN_SD / np.sqrt(len(values)):
+    if taken or np.abs(middle).max() > _BESIDE * sd:
         yield ("the fixes lie beside the trajectory that the surface holds, by "
                + "/".join(f"{b:+.1f}" for b in middle) + f" {unit} (east/north/up): the origin of "
                "the surface may be off, the sensor ride above it (surface.body_height) or the "
@@ -205,6 +215,11 @@ def _on_flight(result):
     if "jump.event_margin" in result.adapted:
         yield ("the first second of the landing stands off the profile, and what follows does not: "
                "a deep landing; heights of that second are left out (jump.event_margin)")
+    if result.profile.sds:
+        yield (f"heights of the landing profile are {abs(result.profile.metres):.1f} m too "
+               f"{'large' if result.profile.metres > 0.0 else 'small'} for the motion that was "
+               f"felt ({abs(result.profile.sds):.0f} standard deviations): snow, another profile "
+               "or origin of it. It counts as much less (a larger sigma of the landing)")
     if not result.stands:
         beside = float(np.median(result.surface["landing"].residual))
         yield (f"after the touch-down the sensor is {abs(beside):.1f} m "

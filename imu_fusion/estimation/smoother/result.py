@@ -8,6 +8,7 @@ from imu_fusion.estimation.smoother.gnss_step import GnssStep
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.jump_result import JumpResult
 from imu_fusion.estimation.smoother.params import SmootherParams
+from imu_fusion.estimation.smoother.profile_fit import ProfileError
 from imu_fusion.estimation.smoother.remarks import remarks_on
 from imu_fusion.estimation.smoother.rests import Rest
 from imu_fusion.estimation.smoother.surface_fit import SurfaceFit
@@ -95,10 +96,13 @@ class SmootherResult:
     ``near_ground``: s until the touch-down, for which the flight is close to the landing profile,
     or below it.
     ``stands``: whether the sensor is at its height above the profile after a touch-down; False:
-    these heights hardly count.
+    these heights hardly count. ``profile``: an error of the landing profile that the readings show,
+    which counts less for it.
     ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
+    ``centre``: (3,) m from the accelerometers, of a tumbling body whose surface.lever_arm is
+    another; None: it is not.
     ``left_out``: number of Imu samples before the start; ``start_found``: whether that was found.
     ``rests``: at which the velocity was taken for zero.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
@@ -125,8 +129,10 @@ class SmootherResult:
     acc_density: float | None = None
     near_ground: float = 0.0
     stands: bool = True
+    profile: ProfileError = ProfileError()
     late: dict[str, float] = field(default_factory=dict)
     lost_turns: tuple[int, ...] = ()
+    centre: np.ndarray | None = None
     rests: tuple[Rest, ...] = ()
     left_out: int = 0
     start_found: bool = False

@@ -23,7 +23,7 @@ _HELD = 0.35       # lost, whatever is stated later; turns are tried once the fi
 _TURNS = 0.25 * np.pi * np.arange(8)
 _WITHIN = 0.4      # rad, to which each of them is known: they lie .8 apart
 _JUDGED = 4.0      # s, after which they are judged
-_SURE = 10.0       # of the log-likelihood, by which the chosen turn has to be likelier than those
+_SURE = 15.0       # of the log-likelihood, by which the chosen turn has to be likelier than those
 _APART = 2         # steps away
 
 

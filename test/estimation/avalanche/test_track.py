@@ -144,7 +144,7 @@ def smoothed(avalanche, log, plane, **changes):
         "initial.position_sd": 0.1, **changes})
     imu = log.imu
     if params.recover_rates:
-        imu = recover(imu, log.mag, recovery_params(params))
+        imu = recover(imu, log.mag, recovery_params(params)).imu
     result = Smoother(params, plane).run(imu[part], log.mag[part])
     error = result.samples["position_world"] - avalanche.motion.position_of(LEVER_ARM)[rows]
     return result, error @ avalanche.slope_axes()

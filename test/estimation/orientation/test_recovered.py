@@ -24,7 +24,7 @@ def rolling():
     axis = np.column_stack([0.8 + 0.1 * np.sin(time), 0.5 + 0.1 * np.cos(1.3 * time),
                             0.33 * np.ones_like(time)])
     true = speed[:, None] * axis
-    steps = Rotation.from_rotvec(true / RATE)
+    steps = Rotation.from_rotvec(0.5 * (true + np.roll(true, -1, axis=0)) / RATE)
     attitude, quats = Rotation.from_euler("xyz", [0.3, 0.2, 1.0]), []
     for step in steps:
         quats.append(attitude.as_quat())
@@ -41,6 +41,8 @@ def test_what_is_recovered_and_what_is_measured_beside_it_state_their_errors(rol
     imu, mag, true = rolling
     found = recover(imu, mag, OrientationParams().replace(**{
         "fusion.use_acc": False, "sensor.gyro_range": (RANGE,), "sensor.gyro_scale_sd": 0.006}))
+    assert found.mag_lag == 0.0 and np.array_equal(found.mag.stamp, mag.stamp)
+    found = found.imu
     assert len(found) == len(imu)
     fast = np.abs(true).max(axis=1) > 1.2 * RANGE
     beside = fast[:, None] & (np.abs(true) < 0.9 * RANGE)
@@ -59,8 +61,18 @@ def test_a_wild_value_is_no_limit(rolling):
     gyr = imu.gyr.copy()
     gyr[700, 1] = 900.0
     found = recover(ImuLog(imu.stamp, gyr, imu.acc), mag, OrientationParams().replace(**{
-        "fusion.use_acc": False, "sensor.gyro_range": (RANGE,)}))
+        "fusion.use_acc": False, "sensor.gyro_range": (RANGE,)})).imu
     assert np.abs(found.gyr - true)[:690].max() < 3.0
+
+
+def test_a_magnetometer_that_is_late_is_taken_earlier(rolling):
+    imu, mag, true = rolling
+    late = MagLog(mag.stamp + 8_000_000, mag.mag)
+    found = recover(imu, late, OrientationParams().replace(**{
+        "fusion.use_acc": False, "sensor.gyro_range": (RANGE,)}))
+    # Of eight seconds in which the field hardly shows the fast axis, half of it.
+    assert 0.003 < found.mag_lag < 0.01
+    assert np.array_equal(found.mag.stamp, late.stamp - round(1e9 * found.mag_lag))
 
 
 def test_an_axis_that_stops_where_the_others_do_is_clipped_too():

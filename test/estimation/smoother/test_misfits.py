@@ -87,6 +87,15 @@ def test_errors_that_wander_are_no_step_and_widen_what_is_stated(logs, clean):
     assert np.median(up) > 1.5 ** 2
 
 
+def test_two_fixes_tell_no_delay(logs):
+    """Of a start and an end that lie too far apart a delay of seconds would make either free."""
+    imu, mag, fix, _ = logs
+    ends = fix[np.arange(len(fix)) % (len(fix) - 1) == 0]
+    apart = dataclasses.replace(ends, longitude_deg=ends.longitude_deg + [0.0, 2e-3])
+    result = Smoother(PARAMS).run(imu, mag, apart)
+    assert len(ends) == 2 and "gnss_time_offset" not in result.states
+
+
 def test_fixes_of_which_many_are_rejected_are_said(logs):
     """Ten seconds of fixes beside the path, as between houses: the loss lets go of them."""
     imu, mag, fix, velocity = logs
@@ -122,9 +131,9 @@ def test_unknown_status_is_usable_and_a_covariance_of_nan_is_unknown():
     assert log.usable.all() and not check_fix(log)
 
 
-def test_errors_that_wander_are_no_delay_in_the_end(logs, monkeypatch):
+def test_errors_that_wander_are_no_delay_in_the_end():
     """At first a delay of the velocities explains part of it; once the wander is known, none."""
-    imu, mag, fix, velocity = logs
+    imu, mag, fix, velocity = drive(30.0)
     rng, error = np.random.default_rng(4), np.zeros((len(fix), 3))
     for k in range(1, len(fix)):    # Gauss-Markov: 5 m over 20 s
         error[k] = np.exp(-0.005) * error[k - 1] + 0.5 * rng.standard_normal(3)

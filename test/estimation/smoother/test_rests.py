@@ -5,6 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
+from imu_fusion.estimation.smoother.attempt import Given, Model, attempt
+from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.samples.logs import FixLog, ImuLog, VelocityLog
 
@@ -52,6 +54,15 @@ def test_a_body_that_rests_has_no_velocity():
             s["cov_velocity"][:, 0, 0]) + 1e-3)
     assert abs(errors[0]) < min(3.0 * sds[0], abs(errors[1])) and sds[0] < 0.2 * sds[1]
     assert np.linalg.norm(with_rests.samples["vel_world"][-150:], axis=1).max() < 0.01
+
+
+def test_noise_is_fitted_to_readings_alone():
+    """A velocity of zero that nobody read is likelier the surer it is said to be."""
+    imu, _, _ = ride((4, 0), (1, 0.5), (1, -0.5), (2, 0))
+    given = Given(imu, None, None, None, None, Rotation.identity().as_quat())
+    found = attempt(given, Model(PARAMS), None)
+    assert found.result.rests
+    assert not fit_noise(found.problem, Model(PARAMS)).noise
 
 
 def test_a_smooth_ride_after_a_rest_is_none():

@@ -4,15 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+import yaml
 
 from benchmarks.jumps import moved
+from imu_fusion.demos.data import data_folder
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
 from imu_fusion.estimation.smoother.measurements.surface_contact import evaluate_constraints
 from imu_fusion.estimation.smoother.params import Gnss, SurfaceContact
+from imu_fusion.estimation.smoother.profile_fit import ProfileError, widened_by_profile
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
+from imu_fusion.estimation.smoother.surface_place import fixes_beside, widen_place
 from imu_fusion.geometry.geodesy import LocalFrame
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, record
 from imu_fusion.simulation.ski_jump import FASTEST_WOBBLE
@@ -59,6 +63,49 @@ def test_a_surface_that_does_not_fit_says_so(jump, recording, result):
     # Fixes that may wander by that much do not lie beside.
     wander = SmootherParams(gnss=Gnss(position_error_sd=(5.0, 5.0, 5.0), position_error_tau=300.0))
     assert Smoother(wander, shifted).run(*logs).remarks() == []
+
+
+@pytest.mark.parametrize("radius", [0.9, 1.1])
+def test_a_landing_of_another_radius_is_said_and_counts_less(jump, recording, radius):
+    """It is half a metre off behind K, takes a trajectory along, and leaves small deviations."""
+    certificate = yaml.safe_load(
+        (data_folder("config") / "surfaces" / "oberstdorf_hs106.yaml").read_text())
+    believed = surface_from_mapping({**certificate, "rL": radius * certificate["rL"]})
+    result = Smoother(SmootherParams(), believed).run(
+        recording.imu, recording.mag, recording.fix, recording.velocity)
+    (text,) = [text for text in result.remarks() if "heights of the landing profile" in text]
+    assert ("too small" if radius > 1.0 else "too large") in text
+    assert 0.2 < abs(result.profile.metres) < 0.6
+    assert abs(result.jump.length - jump.length) < 3 * result.jump.length_sd < 1.0
+
+
+def test_an_error_of_the_profile_that_may_be_chance_widens_what_is_stated(result):
+    wider = widened_by_profile(result, ProfileError(-0.3, -2.5))
+    up, before = (r.samples["cov_position"][:, 2, 2] for r in (wider, result))
+    np.testing.assert_allclose(up - before, 0.09)
+    assert wider.jump.length_sd == pytest.approx(np.hypot(result.jump.length_sd, 0.3))
+    assert wider.jump.length == result.jump.length and wider.remarks() == []
+
+
+def test_a_surface_is_placed_no_better_than_it_says_and_fixes_show():
+    """All of its rows share the error of its origin."""
+    samples = np.zeros(2, SAMPLE)
+    ground = height_constraint("ground", "always", 0.3, lambda e, n: (0 * e, 0 * e, 0 * e))
+
+    def sd(offset, offset_sd):
+        moved_samples = samples.copy()
+        widen_place(moved_samples, [ground], 1.0, np.array(offset), np.array(offset_sd))
+        return np.sqrt(np.diagonal(moved_samples["cov_position"][1]))
+    far = (np.inf,) * 3
+    np.testing.assert_allclose(sd((0.0, 0.0, 0.0), far), [0.0, 0.0, 0.3])
+    np.testing.assert_allclose(sd((0.0, 0.0, 0.0), (0.01, 0.01, 0.01)), [0.0, 0.0, 0.01], atol=1e-4)
+    np.testing.assert_allclose(sd((1.0, -2.0, 0.5), (0.9, 0.9, 0.4)), [0.0, 2.0, 0.24], atol=1e-3)
+    # Single fixes far away are no offset; errors that wander are known less well.
+    residuals = np.random.default_rng(2).standard_normal((400, 3)) + [0.5, 0.0, 0.0]
+    residuals[::20] += 100.0
+    offset, offset_sd = fixes_beside(residuals, 1.0)
+    assert abs(offset[0] - 0.5) < 3 * offset_sd and np.abs(offset[1:]).max() < 3 * offset_sd
+    assert offset_sd == 0.05 and fixes_beside(residuals, 4.0)[1] == 0.2
 
 
 def test_a_surface_says_as_much_per_second_at_any_rate(jump):

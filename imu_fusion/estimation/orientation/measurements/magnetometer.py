@@ -295,18 +295,14 @@ def _innovation(cov, error, rows, variance):
     for i in range(3):
         row = rows[i]
         residual[i] = row.residual
+        spread = es.spread_of(cov, row, es.N)
         for a in range(_COLUMNS):
             residual[i] -= row.coefficient[a] * error[row.index[a]]
         for j in range(i + 1):
             other = rows[j]
             total[i, j] = variance if i == j else 0.0
             for b in range(_COLUMNS):
-                if other.coefficient[b] != 0.0:
-                    line = cov[other.index[b]]
-                    part = 0.0
-                    for a in range(_COLUMNS):
-                        part += row.coefficient[a] * line[row.index[a]]
-                    total[i, j] += other.coefficient[b] * part
+                total[i, j] += other.coefficient[b] * spread[other.index[b]]
     distance = 0.0
     log_det = 0.0
     # Cholesky's factor in place, and the residual through it.

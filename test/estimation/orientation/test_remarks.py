@@ -1,0 +1,24 @@
+"""What is said of estimates that are doubtful."""
+
+import numpy as np
+import pytest
+
+from imu_fusion.estimation.orientation import error_state as es
+from imu_fusion.estimation.orientation.params import OrientationParams, kernel_parameters
+from imu_fusion.estimation.orientation.remarks import remarks
+from imu_fusion.estimation.orientation.state import new_state
+
+
+@pytest.mark.parametrize(("scale", "sd", "said"), [
+    ((-0.08, 0.002, 0.0), 0.005, "8, 0, 0 %"), ((0.0, 0.07, 0.0), 0.009, "0, -7, 0 %"),
+    ((-0.08, 0.0, 0.0), 0.015, None), ((0.03, 0.0, 0.0), 0.001, None)])
+def test_a_scale_is_said_where_it_is_surely_far_off(scale, sd, said):
+    """Of a gyroscope that shows 8 % too much, and not of one of which little is known."""
+    state, par = new_state()[0], kernel_parameters(OrientationParams())
+    state["gyro_scale"][:] = np.diag(scale)
+    for i in range(es.GYRO_SCALE, es.VELOCITY):
+        state["cov"][i, i] = sd ** 2
+    for hypothesis in par[:2]:    # as stated, and poor: what is far off is the same
+        found = remarks(state, hypothesis, 0)
+        assert len(found) == (said is not None)
+        assert said is None or said in found[0]

@@ -1,0 +1,54 @@
+"""The centre of a body that tumbles is where the force does not turn with it."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imu_fusion.estimation.smoother import SmootherParams
+from imu_fusion.estimation.smoother.attempt import other_centre
+from imu_fusion.samples.centre import find_centre
+from imu_fusion.samples.logs import ImuLog
+from imu_fusion.simulation.avalanche import FLUELA, Avalanche
+from imu_fusion.simulation.ball_sensors import LEVER_ARM, BallErrors, record_ball
+from imu_fusion.surfaces.plane import Plane
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Time, force and rate of a ball's whole way, forces with the errors of its sensors."""
+    avalanche = Avalanche(rng=np.random.default_rng(3))
+    log = record_ball(avalanche, np.random.default_rng(4), BallErrors(gyr_range=1e3, gyr_lsb=0.0))
+    return avalanche.motion.time[log.rows], log.imu.acc, log.imu.gyr
+
+
+def test_it_lies_where_the_ball_has_it(ball):
+    found = find_centre(*ball)
+    assert found.point == pytest.approx(-np.array(LEVER_ARM), abs=0.004)
+    assert found.sd.max() < 0.01
+
+
+def test_a_force_that_is_turned_round_puts_it_on_the_other_side(ball):
+    time, force, rate = ball
+    assert find_centre(time, -force, rate).point == pytest.approx(np.array(LEVER_ARM), abs=0.004)
+
+
+def test_what_does_not_tumble_has_none(ball):
+    time, force, rate = ball
+    assert find_centre(time, force, 0.1 * rate) is None
+
+
+@pytest.mark.parametrize(("lever_arm", "phase", "found"), [
+    ((0.0, 0.0, 0.0), "always", True), (-np.array(LEVER_ARM), "always", False),
+    (LEVER_ARM, "always", True), ((0.0, 0.0, 0.0), "in_run", False)])
+def test_the_smoother_is_told_another_one(ball, lever_arm, phase, found):
+    """Not given, given, with the other sign; a jumper's ski is no centre."""
+    time, force, rate = ball
+    params = SmootherParams().replace(**{"surface.lever_arm": tuple(lever_arm)})
+    log = ImuLog(np.round(1e9 * (time - time[0])).astype(np.int64), rate, force)
+    holds = [dataclasses.replace(c, phase=phase)
+             for c in Plane(FLUELA, slope_deg=32.0, aspect_deg=45.0).constraints()]
+    centre = other_centre(SimpleNamespace(
+        params=params, constraints=holds, imu=SimpleNamespace(log=log)))
+    assert (centre is not None) == found
