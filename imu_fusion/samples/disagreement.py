@@ -81,6 +81,8 @@ def check_field_agreement(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
     if abs(late) > _LATE and is_better(by_delay, at_once):
         return [_late(late, "the field", name)]
     left, recorded = _left(windows, with_bias=True)
+    if left < _FITS_CALMLY:
+        return []
     found = _other_scale(windows, recorded, "the field", name, with_bias=True)
     return found or ([_not_at_all(left, "the field", name)] if left > _NOT_AT_ALL else [])
 
