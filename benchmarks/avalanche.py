@@ -384,7 +384,8 @@ def orientation_rows(out):
                "goal 1; 97 to 100; .7 to 1.6")
         found, expected = np.degrees(np.sqrt(bound.mean(axis=0)))
         yield (f"the same at rest, by force and field with the errors that they have{name}: RMS, deg; expected of the best estimator (Cramér-Rao), deg",
-               f"{found:.2f}; {expected:.2f}", "nothing later tells the turn about the field")
+               f"{found:.2f}; {expected:.2f}",
+               "later only terrain and fixes tell the turn about the field: see the smoother's attitude")
 
 
 def report(seeds, count):
@@ -424,7 +425,7 @@ def report(seeds, count):
     rows.append(("bound of the 70 s between known ends, attitude and constants of the sensors known, only the "
                  "accelerometer's samples noisy: along one axis, m; with the gap",
                  f"{least_error((0.0, 0.0)):.2f}; {least_error(BallErrors().gap):.2f}",
-                 "no estimator does better along the slope"))
+                 "no estimator does better; goal .5/.8"))
     p = np.abs(np.array(out["phases"]))
     hits = np.mean(p < WITHIN, axis=0)
     rows.append((f"phases within {WITHIN} s, % of seeds: " + ", ".join(NAMES[1:]),

@@ -66,7 +66,7 @@ def test_stream_batch_and_pieces_are_the_same(recording, changes):
     assert feed(live, imu, mag).tobytes() == rows.tobytes()
     again = whole.take_corrected()
     assert live.take_corrected().tobytes() == again.tobytes()
-    for cut in (first - 1, first, first + 1, first + 100):
+    for cut in (first - 1, first, first + 100):
         pieces = OrientationEstimator(params)
         border = imu.stamp[cut]
         parts = [pieces.run(imu[:cut], mag[mag.stamp < border])]

@@ -10,7 +10,7 @@ from imu_fusion.estimation.orientation.state import new_state
 
 
 @pytest.mark.parametrize(("scale", "sd", "said"), [
-    ((-0.08, 0.002, 0.0), 0.005, "8, 0, 0 %"), ((0.0, 0.07, 0.0), 0.009, "0, -7, 0 %"),
+    ((-0.08, 0.002, 0.0), 0.005, "8, 0, 0 %"), ((0.0, 0.09, 0.0), 0.009, "0, -9, 0 %"),
     ((-0.08, 0.0, 0.0), 0.015, None), ((0.03, 0.0, 0.0), 0.001, None)])
 def test_a_scale_is_said_where_it_is_surely_far_off(scale, sd, said):
     """Of a gyroscope that shows 8 % too much, and not of one of which little is known."""

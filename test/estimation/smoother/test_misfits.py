@@ -131,9 +131,9 @@ def test_unknown_status_is_usable_and_a_covariance_of_nan_is_unknown():
     assert log.usable.all() and not check_fix(log)
 
 
-def test_errors_that_wander_are_no_delay_in_the_end(logs, monkeypatch):
+def test_errors_that_wander_are_no_delay_in_the_end():
     """At first a delay of the velocities explains part of it; once the wander is known, none."""
-    imu, mag, fix, velocity = logs
+    imu, mag, fix, velocity = drive(30.0)
     rng, error = np.random.default_rng(4), np.zeros((len(fix), 3))
     for k in range(1, len(fix)):    # Gauss-Markov: 5 m over 20 s
         error[k] = np.exp(-0.005) * error[k - 1] + 0.5 * rng.standard_normal(3)

@@ -154,7 +154,7 @@ def test_filtered_velocities_need_their_state(jump):
               SmootherParams(gnss=Gnss(velocity_error_sd=sd, velocity_error_tau=1.0)),
               SmootherParams())
     found = []
-    for seed in range(4):
+    for seed in range(2):
         filtered = record(jump, np.random.default_rng(seed), gnss=GnssErrors(velocity_tau=1.0))
         truth = filtered.motion.vel_world
         for params in models:
@@ -162,7 +162,7 @@ def test_filtered_velocities_need_their_state(jump):
             found.append((nees(r.samples["vel_world"] - truth, r.samples["cov_velocity"]).mean(),
                           r.wander["velocity"]))
         assert "gnss.velocity_error_sd" in r.adapted
-    (white, states, adapted), (noticed, *none) = np.mean(np.reshape(found, (4, 3, 2)), axis=0).T
+    (white, states, adapted), (noticed, *none) = np.mean(np.reshape(found, (2, 3, 2)), axis=0).T
     # Ideal 3; ten seeds of the benchmark give 3.2 with states.
     assert 1.0 < states < 6.0 and 1.0 < adapted < 6.0 and none == [1.0, 1.0]
     assert 1.0 < white < 6.0 and noticed > 2.0 and white * noticed ** 2 > 15.0
