@@ -202,6 +202,21 @@ def filtered(rng):
     return readings
 
 
+def drifting(rng):
+    readings = felt(rng, 1e-3, 0.035)
+    end = rng.choice([-1.0, 1.0], (1, *readings.shape[1:]))
+    return readings + MOTION.t[:, None, None] * end
+
+
+def all_filtered(rng):
+    """A first-order low-pass of 5 ms that all have in common."""
+    readings = felt(rng, 1e-3, 0.035)
+    share = 1.0 - np.exp(-1e-3 / 5e-3)
+    for n in range(1, len(readings)):
+        readings[n] = readings[n - 1] + share * (readings[n] - readings[n - 1])
+    return readings
+
+
 def seldom(rng):
     readings = felt(rng, 1e-3, 0.035)
     readings[np.arange(len(readings)) % 10 != 0, 1] = np.nan
@@ -337,6 +352,11 @@ FIELD_ROWS = [
               biased),
     field_row("one of four behind a low-pass of 5 ms, 1 mm and 2 deg off", "", filtered),
     field_row("one of four at a tenth of the rate, 1 mm and 2 deg off", "", seldom),
+    field_row("biases drift by 1 m/s^2 in 1 s (bias_walk 0), 1 mm and 2 deg off", "", drifting),
+    field_row("all behind a low-pass of 5 ms, 1 mm and 2 deg off", "", all_filtered),
+    field_row("given rate off by 1 rad/s, 1 mm and 2 deg off", "",
+              lambda rng: felt(rng, position_sd=1e-3, axes_sd=0.035),
+              initial=FIELD.initial.replace(angular_velocity=(6.0, 5.0, 5.0))),
     *(spinning_row(speed, axis, use_gyro, "silent") for speed, axis, use_gyro in (
         (0.6, (1.0, 0.0, 0.0), False), (1.7, (0.0, 0.0, 1.0), True), (5.0, (0.0, 0.0, 1.0), False),
         (1.7, (0.0, 0.0, 1.0), False))),

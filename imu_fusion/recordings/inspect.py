@@ -15,10 +15,10 @@ from imu_fusion.messages.orientation_status import FLAGS_TYPE
 from imu_fusion.recordings.bag_reader import Reader
 from imu_fusion.recordings.logs import LogCollector, undecodable
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
+from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import Log
 from imu_fusion.samples.travel import check_travel
-from imu_fusion.samples.turning import check_axes
 
 _HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 _LATEST = 2**63 - 1    # of log times, which MCAP counts to twice as far

@@ -7,32 +7,31 @@ iron add is the same under all; the hypothesis under which most of the spread go
 """
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.samples.findings import Finding
-from imu_fusion.samples.logs import ImuLog, MagLog, seconds
+from imu_fusion.samples.logs import ImuLog
 
 _WINDOW = 2.0           # s: the body turns, a bias hardly adds
 _STEP = 0.01            # s of the integration
 _MOST = 60              # windows that are looked at
-_FEWEST = 3             # windows that prove anything
-_TURNED = 0.5           # rad by which the direction must turn within a window
+FEWEST = 3             # windows that prove anything
+TURNED = 0.5           # rad by which the direction must turn within a window
 _BETTER = 0.5           # of the spread: what the right hypothesis leaves of it
 _SHARE = 0.8            # of the windows in which it is better,
 _PROOF = 5.0            # by so many standard errors
-_EXPLAINED = 0.1        # of the spread is left where nothing is wrong and nothing disturbs
+EXPLAINED = 0.1        # of the spread is left where nothing is wrong and nothing disturbs
 _EXACTLY = 1e-3         # where there is no noise, either
 _GRAVITY = 9.81
-_LEAST_TURN = 0.26      # rad: frames that differ by less are a matter of calibration
+LEAST_TURN = 0.26      # rad: frames that differ by less are a matter of calibration
 _PATH = 10.0            # rad that the rates say within a window: few sensors turn by more
 _LIKE_GRAVITY = (0.7, 1.3)   # times 9.81 m/s^2: where the rates are that high, but the force is not
 _RESTING = 0.35         # rad/s: no bias is that large (20 deg/s)
 _STANDS = 0.05          # rad/s by which a direction may turn that stands still
-_STUCK = 0.02           # of the field: a magnetometer that turned by 30 deg and did not change
-_SCATTER = 0.3          # of its mean, by which the norm of a field may scatter while turning
 _DEGREE = np.pi / 180.0
 
 
@@ -103,7 +102,7 @@ class Windows:
             turned = np.maximum(turned, np.where(calm & (path > _PATH), path / _PATH, 0.0))
         turned = np.where(whole, turned, 0.0)
         best = np.argsort(-turned, kind="stable")[:_MOST]
-        best = best[turned[best] > _TURNED]
+        best = best[turned[best] > TURNED]
         self.rates, self.vectors = self.rates[best], self.vectors[best]
 
     def __len__(self) -> int:
@@ -165,12 +164,12 @@ def gravity_follows(stamp: np.ndarray, gyr: np.ndarray, acc: np.ndarray) -> bool
 def gravity_verdict(imu: ImuLog) -> Verdict:
     """Whether gravity turns as the gyroscope says; ``axes`` of the verdict are the rates'."""
     windows = Windows(imu.stamp, imu.gyr, imu.acc, _GRAVITY)
-    if len(windows) < _FEWEST:
+    if len(windows) < FEWEST:
         return Verdict("unknown")
     right = windows.turns()
     still = np.broadcast_to(np.eye(3), right.shape)
     recorded = spread(right, windows.vectors)
-    if np.median(recorded / spread(still, windows.vectors)) < _EXPLAINED:
+    if np.median(recorded / spread(still, windows.vectors)) < EXPLAINED:
         return Verdict("fits")
     turns = {(scale, sign): windows.turns(scale * sign)
              for scale in (1.0, _DEGREE) for sign in (1.0, -1.0)}
@@ -187,42 +186,13 @@ def gravity_verdict(imu: ImuLog) -> Verdict:
     if simple.sum() < 1.2 * best.sum():
         best, axes = simple, np.eye(3)
     if scale == 1.0 and not is_better(best, recorded):
-        best, axes = _best_rotation(lambda axes: spread_of(1.0, axes), axes)
+        best, axes = best_rotation(lambda axes: spread_of(1.0, axes), axes)
     if not is_better(best, recorded):
         return Verdict("unknown")
     if scale != 1.0:
         return Verdict("rates in deg/s", axes)
     verdict = Verdict("axes", axes)
-    return Verdict("unknown") if verdict.angle < _LEAST_TURN else verdict
-
-
-def field_verdict(imu: ImuLog, mag: MagLog) -> Verdict:
-    """Whether the field turns as the gyroscope says, for a magnetometer in other axes; ``axes`` of
-    the verdict are those of the field."""
-    time = seconds(imu.stamp, imu.stamp[0])
-    if np.any(np.diff(time) <= 0.0) or len(mag) < 2:
-        return Verdict("unknown")
-    measured = seconds(mag.stamp, imu.stamp[0])
-    fields = np.column_stack([np.interp(time, measured, mag.mag[:, i], left=np.nan, right=np.nan)
-                              for i in range(3)])
-    windows = Windows(imu.stamp, imu.gyr, fields)
-    if len(windows) < _FEWEST:
-        return Verdict("unknown")
-    turns = windows.turns()
-    recorded = spread(turns, windows.vectors, with_bias=True)
-    still = np.broadcast_to(np.eye(3), turns.shape)
-    if np.median(recorded / spread(still, windows.vectors)) < _EXPLAINED:
-        return Verdict("fits")
-    found = [(spread(turns, windows.vectors @ axes.T, with_bias=True), axes)
-             for axes in signed_permutations()]
-    best, axes = min(found, key=lambda each: each[0].sum())
-    if not is_better(best, recorded):
-        best, axes = _best_rotation(
-            lambda axes: spread(turns, windows.vectors @ axes.T, with_bias=True), axes)
-    if not is_better(best, recorded):
-        return Verdict("unknown")
-    verdict = Verdict("axes", axes)
-    return Verdict("unknown") if verdict.angle < _LEAST_TURN else verdict
+    return Verdict("unknown") if verdict.angle < LEAST_TURN else verdict
 
 
 def is_better(best: np.ndarray, recorded: np.ndarray) -> bool:
@@ -234,8 +204,9 @@ def is_better(best: np.ndarray, recorded: np.ndarray) -> bool:
                 and np.mean(gain > 0) >= _SHARE)
 
 
-def _best_rotation(spread_of, axes):
-    """The rotation near (or far from) ``axes`` with the least spread, and that."""
+def best_rotation(spread_of: Callable[[np.ndarray], np.ndarray],
+                  axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least spread_of(axes) (w,) by a rotation near (or far from) ``axes`` (3, 3), and that."""
     if np.linalg.det(axes) < 0.0:
         axes = -axes
     rotation = scipy.spatial.transform.Rotation
@@ -299,123 +270,3 @@ def _rate_at_rest(imu):
     rates = np.linalg.norm(np.cross(gyr.mean(axis=1), up), axis=1)
     still = (turned < _STANDS) & (shaken < 0.02) & np.isfinite(rates)
     return float(np.median(rates[still])) if still.any() else np.nan
-
-
-def check_axes(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
-    """A finding if the field does not turn against the gyroscope as it must."""
-    if len(imu) < 3 or len(mag) < 3 or not mag.mag.any() or np.any(np.diff(imu.stamp) <= 0):
-        return []    # check_stamps and check_field have said so
-    slope, correlation = _field_slope(imu, mag)
-    if correlation > 0.5 and 0.5 < np.degrees(slope) < 2.0:
-        return [Finding("unit", f"{name}: the field turns {slope:.3g} times as fast as the "
-                                "gyroscope says: angular velocity in deg/s; multiply by pi/180",
-                        unusable=True)]
-    if correlation < -0.5:
-        return [Finding("axes", f"{name}: the field turns with the gyroscope instead of against "
-                                "it: one of them has its sign or axes reversed", unusable=True)]
-    stuck = _stuck(imu, mag, name)
-    if stuck:
-        return stuck
-    verdict = field_verdict(imu, mag)
-    if verdict.kind == "axes":
-        return [_other_axes(_northern(verdict, imu, mag), name)]
-    return _scatter(imu, mag, name)
-
-
-def _northern(verdict, imu, mag):
-    """The Verdict with the signs with which the field points down, as on the northern hemisphere:
-    reversed, it stands still as well."""
-    time, measured = seconds(imu.stamp, imu.stamp[0]), seconds(mag.stamp, imu.stamp[0])
-    up = np.column_stack([np.interp(measured, time, imu.acc[:, i]) for i in range(3)])
-    upwards = float(np.nanmean(np.sum((mag.mag @ verdict.axes.T) * up, axis=1)))
-    return Verdict(verdict.kind, -verdict.axes) if upwards > 0.0 else verdict
-
-
-def _other_axes(verdict, name):
-    """Finding on a magnetometer in axes other than the gyroscope's."""
-    matrix = ", ".join(f"{v:.3g}" for v in (verdict.axes + 0.0).ravel())
-    how = (f"it fits if x, y, z of the Imu are ({verdict.letters}) of the magnetometer"
-           if verdict.letters else
-           "it fits if the magnetometer is turned" + (
-               " and mirrored" if np.isnan(verdict.angle) else
-               f" by {np.degrees(verdict.angle):.0f} deg"))
-    if verdict.letters == "y, x, -z":
-        how += " (an AK8963, as inside of an MPU-9250)"
-    return Finding("axes", f"{name}: the field does not turn as the gyroscope says, {how}; on "
-                           "the southern hemisphere with all signs reversed: turn it in the "
-                           f"driver, or set sensor.mag_matrix: [{matrix}]", unusable=True)
-
-
-def _stuck(imu, mag, name):
-    """A finding on a magnetometer that does not change while the body turns."""
-    if not np.isfinite(mag.mag).any(axis=0).all():
-        return []
-    norm = np.linalg.norm(np.nanmean(mag.mag, axis=0))
-    if not np.nanstd(mag.mag, axis=0).max() < _STUCK * norm:
-        return []
-    windows = Windows(imu.stamp, imu.gyr, imu.acc)
-    if len(windows) < _FEWEST:
-        return []
-    field = np.nanmean(mag.mag, axis=0) / norm
-    turned = spread(windows.turns(), np.broadcast_to(field, windows.vectors.shape))
-    # Its direction would vary by as much.
-    if np.median(turned) < _TURNED ** 2 / 12.0:
-        return []
-    return [Finding("held", f"{name}: the field does not change while the gyroscope turns: stuck, "
-                            "or not on the same body; leave it out (remap the topic)",
-                    unusable=True)]
-
-
-def _scatter(imu, mag, name):
-    """A finding on a field whose norm scatters while the body turns."""
-    rates = np.linalg.norm(imu.gyr, axis=1)
-    near = np.clip(np.searchsorted(imu.stamp, mag.stamp), 0, len(imu) - 1)
-    norms = np.linalg.norm(mag.mag, axis=1)[rates[near] > _TURNED]
-    norms = norms[np.isfinite(norms)]
-    if len(norms) < 100:
-        return []
-    middle = float(np.median(norms))
-    low, high = np.percentile(norms, [16, 84])
-    scatter = float(high - low) / 2.0 / middle
-    if scatter < _SCATTER:
-        return []
-    return [Finding("unit", f"{name}: the field's magnitude scatters by {scatter:.0%} while the "
-                            "sensor turns: calibrate the magnetometer (service "
-                            "calibrate_magnetometer), or look for iron near it")]
-
-
-def _field_slope(imu, mag):
-    """(slope, correlation) of the measured on the predicted change of the field's direction.
-
-    The direction b of a constant field obeys ``db/dt = b x w`` in sensor axes (Winkler 2025,
-    eq. B.3). The slope is 1; degrees per second give pi/180, a gyroscope of opposite sign or other
-    axes something else. Both are summed over blocks of a tenth of a second, in which the field
-    turns by more than the magnetometer's noise. (nan, nan) where nothing turns.
-    """
-    step = seconds(mag.stamp[1:], mag.stamp[0]) - seconds(mag.stamp[:-1], mag.stamp[0])
-    norm = np.linalg.norm(mag.mag, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        direction = mag.mag / norm[:, None]
-    middle = seconds(mag.stamp[:-1], imu.stamp[0]) + 0.5 * step
-    time = seconds(imu.stamp, imu.stamp[0])
-    if np.any(np.diff(time) <= 0) or np.median(step) <= 0:
-        return np.nan, np.nan
-    gyr = np.column_stack([np.interp(middle, time, imu.gyr[:, i], left=np.nan, right=np.nan)
-                           for i in range(3)])
-    predicted = np.cross(0.5 * (direction[1:] + direction[:-1]), gyr) * step[:, None]
-    measured = np.diff(direction, axis=0)
-    unusable = (step <= 0) | (step > 0.2)
-    predicted[unusable] = np.nan
-    length = max(int(round(0.1 / np.median(step))), 1)
-    blocks = len(step) // length
-    predicted, measured = (
-        change[:blocks * length].reshape(blocks, length, 3).sum(axis=1)
-        for change in (predicted, measured))
-    usable = np.isfinite(predicted).all(axis=1) & np.isfinite(measured).all(axis=1)
-    predicted, measured = predicted[usable].ravel(), measured[usable].ravel()
-    if not predicted.any() or not measured.any():
-        return np.nan, np.nan
-    product = float(predicted @ measured)
-    slope = product / float(predicted @ predicted)
-    correlation = product / np.sqrt(float(predicted @ predicted) * float(measured @ measured))
-    return slope, correlation

@@ -57,7 +57,7 @@ def draw_motion(params: AccelerationFieldParams, start: Start, samples: int,
     Returns:
         (states (samples, N) with biases and mounting at the end, quaternions (samples, 4)).
     """
-    mean, cov, quat = start
+    mean, cov, quat, _ = start
     variance, vectors = np.linalg.eigh(cov)
     x = mean + vectors @ (np.sqrt(np.maximum(variance, 0.0)) * rng.standard_normal(len(mean)))
     quat = quat_normalize(quat_multiply(quat, quat_exp(parts(x).theta)))

@@ -17,8 +17,9 @@ from imu_fusion.messages.convert import GYROSCOPE_FIRST, SAMPLE_TYPES
 from imu_fusion.messages.layouts import FIX, MAG
 from imu_fusion.samples import ImuLog, MagLog, checks
 from imu_fusion.samples.blocks import Samples, joined
+from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.findings import Finding
-from imu_fusion.samples.turning import check_axes, check_turning
+from imu_fusion.samples.turning import check_turning
 from imu_fusion.sensors.magnetometer_calibration import MagCalibration, MagCalibrator
 from imu_fusion.streams.orientation_messages import (
     OUTPUTS,

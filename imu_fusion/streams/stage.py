@@ -9,9 +9,9 @@ from imu_fusion.messages.convert import SampleType
 from imu_fusion.parameters.declare import Parameters
 from imu_fusion.parameters.file import ParamsFile, parameters_for
 from imu_fusion.samples import checks
+from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.travel import check_travel
-from imu_fusion.samples.turning import check_axes
 from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC, VELOCITY_TOPIC
 
 

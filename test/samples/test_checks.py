@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.samples import checks
+from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.flat_tops import GYRO_FLOOR, flat_tops
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog
-from imu_fusion.samples.turning import check_axes
 
 RATE = 100
 GRAVITY_WORLD = np.array([0.0, 0.0, 9.81])

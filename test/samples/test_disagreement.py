@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_fusion.samples.checks import check_imu
-from imu_fusion.samples.disagreement import check_agreement
-from imu_fusion.samples.logs import ImuLog
+from imu_fusion.samples.disagreement import check_agreement, check_field_agreement
+from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.samples.standing import check_standing
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 
@@ -101,3 +101,28 @@ def test_a_gyroscope_whose_steps_are_coarser_than_its_rest_is_not_dead():
     gyr[:1000], acc = 0.0, imu.acc.copy()
     acc[:1000] = [0.0, 0.0, 9.81] + np.random.default_rng(1).normal(0.0, 0.02, (1000, 3))
     assert check_standing(ImuLog(imu.stamp, gyr, acc), "imu") == []
+
+
+@pytest.mark.parametrize("spoil, word", [
+    (lambda imu, t: imu.gyr, None),
+    (lambda imu, t: np.column_stack([np.interp(t - 0.1, t, rate) for rate in imu.gyr.T]),
+     "100 ms later than the magnetometer"),
+    (lambda imu, t: 0.5 * imu.gyr, "2 times as fast"),
+    (lambda imu, t: recording(101).gyr, "does not turn as the gyroscope says")])
+def test_the_field_tells_of_a_gyroscope_however_it_is_shaken(spoil, word):
+    imu, mag = simulate(Tumbling(seed=1, travel_sd=0.4), 25.0, rate=100.0, sensors=SENSORS,
+                        seed=1)[:2]
+    iron = MagLog(mag.stamp, mag.mag + [1e-5, -2e-5, 1.5e-5])
+    gyr = spoil(imu, (imu.stamp - imu.stamp[0]) * 1e-9)
+    found = check_field_agreement(ImuLog(imu.stamp, gyr, imu.acc), iron, "mag")
+    assert len(found) == (word is not None)
+    assert all(word in finding.text for finding in found)
+
+
+def test_accelerations_hide_no_delay_that_explains_most_of_what_turns():
+    imu = recording(3, travel_sd=0.2)
+    t = (imu.stamp - imu.stamp[0]) * 1e-9
+    gyr = np.column_stack([np.interp(t - 0.1, t, rate) for rate in imu.gyr.T])
+    (finding,) = check_agreement(ImuLog(imu.stamp, gyr, imu.acc), "imu")
+    assert float(finding.text.split("were ")[1].split()[0]) == pytest.approx(100.0, abs=40.0)
+    assert "later than the accelerometer" in finding.text

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.logs import ImuLog, MagLog
-from imu_fusion.samples.turning import check_axes, check_turning, signed_permutations
+from imu_fusion.samples.turning import check_turning, signed_permutations
 from test.samples.test_checks import recording
 
 # The magnetometer of an AK8963 beside the gyroscope of its MPU-9250: x and y exchanged, z negated.

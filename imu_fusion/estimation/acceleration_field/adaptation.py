@@ -19,11 +19,13 @@ from imu_fusion.kernels import njit
 #: of innovations with those of the sample before, fading; ``grace``: samples for which nothing is
 #: judged yet; ``samples`` in which something was taken to be larger, and how much the ``most`` was,
 #: as a factor on standard deviations, of each kind; samples after which the angular velocity is
-#: ``vague``, see :mod:`.hardly_known_rate`; ``tracked``: see :mod:`.motion_watch`.
+#: ``vague``, see :mod:`.hardly_known_rate`; ``tracked``: see :mod:`.motion_watch`; ``about``,
+#: ``score`` and ``information``: see :mod:`.wrong_start`.
 ADAPTATION = np.dtype([
     ("noise", "f8"), ("motion", "f8"), ("product", "f8"), ("square", "f8"),
     ("grace", "i8"), ("samples", "i8", 2), ("most", "f8", 2), ("vague", "i8"),
-    ("tracked", "f8", (6, 6))],
+    ("tracked", "f8", (6, 6)), ("about", "f8", 3), ("score", "f8", 3),
+    ("information", "f8", (3, 3))],
     align=True)
 
 _EXPECTED = 1.5     # mean square of a channel's innovation that is no excess, in its variances

@@ -255,15 +255,11 @@ def learns_mounting(state, p, channels, at, work):
     """Whether a sample tells of the mounting: where a body hardly turns, the rows of its states
     change with the noise of the state that they are linearised at, and would seem to. Beyond a
     share of what was known of it, errors of the linearisation would, too."""
-    if work.is_settled[0]:
+    if work.is_settled[0] or not turns(p, channels, at, _EXCITING):
         return False
-    omega, alpha = at[OMEGA:ALPHA], at[ALPHA:ALPHA + 3]
-    speed = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
-    turning = alpha[0] * alpha[0] + alpha[1] * alpha[1] + alpha[2] * alpha[2]
-    noise, left, first = 0.0, 0.0, 0.0
+    left, first = 0.0, 0.0
     for c in range(len(channels)):
         channel = channels[c]
-        noise = max(noise, noise_variance(channel, p))
         for i in range(3):
             if channel.turn >= 0:
                 left += state.cov[channel.turn + i, channel.turn + i] / channel.axes_sd ** 2
@@ -274,8 +270,20 @@ def learns_mounting(state, p, channels, at, work):
         if channel.scale >= 0:
             left += state.cov[channel.scale, channel.scale] / channel.scale_sd ** 2
             first += 1.0
-    return (p.radius * p.radius * (turning + speed * speed) > _EXCITING * _EXCITING * noise
-            and left > _LEFT * _LEFT * first)
+    return left > _LEFT * _LEFT * first
+
+
+@njit
+def turns(p, channels, at, times):
+    """Whether a body turns as at (N,) so much that it makes so many ``times`` the noise of the
+    readings."""
+    omega, alpha = at[OMEGA:ALPHA], at[ALPHA:ALPHA + 3]
+    speed = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
+    turning = alpha[0] * alpha[0] + alpha[1] * alpha[1] + alpha[2] * alpha[2]
+    noise = 0.0
+    for c in range(len(channels)):
+        noise = max(noise, noise_variance(channels[c], p))
+    return p.radius * p.radius * (turning + speed * speed) > times * times * noise
 
 
 @njit

@@ -107,7 +107,7 @@ class AccelerationFieldEstimator:
                          "exact: what it states leaves their errors out; use rigid_body, or say "
                          "that they are (position_sd, axes_sd and scale_sd 0)")
         if self._judged is not None:
-            found += fit_remarks(self.sensor_fits(), self.array, self._judged)
+            found += fit_remarks(self.sensor_fits(), self.array, self.params, self._judged)
         found += [text for text in self._standing.texts(self.names).values() if text not in found]
         found += coarse_remarks(self.names, self.array, self.params, self._limits.steps)
         unit = {"gyroscope": "rad/s"}

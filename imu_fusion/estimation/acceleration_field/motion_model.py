@@ -58,6 +58,7 @@ class State(NamedTuple):
     adaptation: np.ndarray   # (1,) ADAPTATION
     innovation: np.ndarray   # (m,) of the last sample, before it was used
     fitted: np.ndarray   # (m,) bool, channels whose fit is followed, see motion_watch
+    error: np.ndarray    # (N, 3) of x, by errors of the first angular velocity, see wrong_start
 
 
 class Step(NamedTuple):

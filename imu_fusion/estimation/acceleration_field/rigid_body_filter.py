@@ -41,6 +41,7 @@ from imu_fusion.estimation.acceleration_field.measurement import (
 )
 from imu_fusion.estimation.acceleration_field.misfit import widening
 from imu_fusion.estimation.acceleration_field.motion_model import (
+    ALPHA,
     BIAS,
     OMEGA,
     THETA,
@@ -56,6 +57,7 @@ from imu_fusion.estimation.acceleration_field.params import AccelerationFieldPar
 from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_rigid_row
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
+from imu_fusion.estimation.acceleration_field.wrong_start import fit_start, move_on
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 from imu_fusion.kernels import njit
 
@@ -80,6 +82,7 @@ def _predict_to(stamp, state, p, channels, step, trace, n):
             step.dt[0] = -1.0
             state.adaptation[0].grace = GRACE
             reopen(state.x, state.cov, dt, p.spread)
+            state.error[:] = 0.0
             trace.phi[n] = 0.0
             trace.dt[n] = -dt
         else:
@@ -87,6 +90,7 @@ def _predict_to(stamp, state, p, channels, step, trace, n):
                 step.dt[0] = dt
                 step.chain[:], step.noise[:] = motion_step(dt, p.motion.rate)
             trace.phi[n] = predict(state, p, channels, step)
+            move_on(state, step, trace.phi[n])
             trace.dt[n] = dt
     state.last[0] = stamp
     return flags
@@ -121,6 +125,7 @@ def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, wor
     if is_causal and not learns_mounting(state, p, channels, at, work):
         open_states = BIAS + m
     found = update(state, p, channels, reading, at, work, trace, n, open_states)
+    fit_start(state, p, channels, at, work, trace, n, open_states)
     if work.is_settled[0] and is_hardly_known(state, channels, p):
         state.adaptation[0].vague += 1
     if found.used > 0 and p.is_adaptive:
@@ -262,6 +267,8 @@ def _first_state(start, array):
     state = State(start.x.copy(), start.cov.copy(), start.quat.copy(),
                   np.array([-1], dtype=np.int64), np.zeros(array.accelerometers, CHECK),
                   np.zeros(1, ADAPTATION), np.zeros(len(array.channels)),
-                  np.zeros(len(array.channels), bool))
+                  np.zeros(len(array.channels), bool), np.zeros((len(start.x), 3)))
     state.adaptation["grace"] = GRACE
+    state.error[OMEGA:ALPHA] = np.eye(3)
+    state.adaptation["about"] = start.about
     return state

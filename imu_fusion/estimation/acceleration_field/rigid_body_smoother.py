@@ -176,7 +176,9 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start,
         found = smooth_once(params, array, start, stamp, readings, at)
         # Where the filter did not know the rate, iterations may settle on the wrong sign of it.
         vague = max(vague, int(found.last.adaptation["vague"][0]))
-        if iteration > 0:
+        if iteration == 0:
+            first = found.last.adaptation
+        else:
             moved = parts(found.mean).omega - parts(at).omega
             if np.all(moved ** 2 <= 1e-6 * parts(np.einsum("nii->ni", found.cov)).omega):
                 break
@@ -185,6 +187,8 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start,
     _put_smoothed(kernel_params(params, array), array.channels, stamp, readings, found.used,
                   found.mean, found.cov, start.quat.copy(), rows)
     found.last.adaptation["vague"] = vague
+    for name in ("score", "information"):
+        found.last.adaptation[name] = first[name]
     return rows, found.last
 
 

@@ -9,6 +9,7 @@ import scipy  # its parts are loaded where they are first used
 from imu_fusion.estimation.acceleration_field.motion_model import BIAS, State
 from imu_fusion.estimation.acceleration_field.params import AccelerationFieldParams
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
+from imu_fusion.estimation.acceleration_field.wrong_start import start_remarks
 
 _SAMPLES = 10       # left out: fewer are single wild readings, without a cause to name
 _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave over
@@ -105,7 +106,8 @@ def coarse_remarks(names: list[str], array: SensorArray, params: AccelerationFie
     return remarks
 
 
-def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list[str]:
+def fit_remarks(fits: list[SensorFit], array: SensorArray, params: AccelerationFieldParams,
+                state: State) -> list[str]:
     """What is wrong with the sensors, single ones and as a whole, and what to do."""
     or_gyro = (", or unit, axes and sign of the gyroscope" if array.channels["is_gyro"].any()
                else "")
@@ -144,7 +146,7 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, state: State) -> list
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
             "motion.jerk_density and motion.acceleration_rate_density, or use maximum_likelihood")
-    return remarks
+    return remarks + start_remarks(adaptation, params.initial)
 
 
 def _biases(fits, array, state):

@@ -35,6 +35,7 @@ _LARGEST_BIAS = 0.35    # rad/s (20 deg/s): no gyroscope has more
 _SWAY = 0.15            # rad/s from the first half to the last: a hand does not sway faster
 _STRANGE = 0.2          # of gravity, that scales and a calibration may miss it by
 _SURELY = 4.0           # standard deviations
+_UNNOTICED = 3.0        # standard deviations of the square of a rate that is not refuted
 
 
 class Start(NamedTuple):
@@ -43,6 +44,8 @@ class Start(NamedTuple):
     x: np.ndarray      # (N,)
     cov: np.ndarray    # (N, N)
     quat: np.ndarray   # (4,) world from body
+    about: np.ndarray  # (3,) rad/s: the largest turn, in body axes, that a body taken for still may
+    #                    make unnoticed; 0 where none was
 
 
 def given_start(params: AccelerationFieldParams, array: SensorArray) -> Start:
@@ -59,7 +62,7 @@ def given_start(params: AccelerationFieldParams, array: SensorArray) -> Start:
     cov = np.zeros((len(x), len(x)))
     cov[:moving, :moving] = np.diag(sd ** 2)
     cov[moving:, moving:] = mounting
-    return Start(x, cov, normalized(initial.orientation))
+    return Start(x, cov, normalized(initial.orientation), np.zeros(3))
 
 
 def rest_start(params: AccelerationFieldParams, array: SensorArray,
@@ -71,7 +74,7 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
     The part of the biases that cannot be told from the tilt stays uncertain, correlated with it.
     """
     channels = array.channels
-    x, cov, quat = given_start(params, array)
+    x, cov, quat, about = given_start(params, array)
     parts(x).omega[:] = 0.0
     still = np.r_[THETA:OMEGA, ALPHA:ACC, ACC_RATE:BIAS]
     cov[still, :] = 0.0
@@ -80,10 +83,12 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
     number = seen.sum(axis=0)
     with np.errstate(invalid="ignore"):
         mean = np.where(seen, readings, 0.0).sum(axis=0) / number
-    use = _agreeing(params, array, Start(x, cov, quat), mean)
+    use = _agreeing(params, array, Start(x, cov, quat, about), mean)
     rows = _still_rows(array, mean, use, len(x))
     variance = ((params.noise_scale * channels["density"][use]) ** 2 * params.sample_rate
                 / number[use])
+    if array.specific_force and not np.any(channels["is_gyro"] & use):
+        about = _unnoticed(channels[use], rows[use], mean[use], cov, variance)
     x, cov = _update(x, cov, rows[use], mean[use], np.diag(variance))
     constraint = np.zeros((3, len(x)))
     constraint[:, ACC:ACC_RATE] = np.eye(3)
@@ -97,15 +102,31 @@ def rest_start(params: AccelerationFieldParams, array: SensorArray,
         cov[THETA:OMEGA, THETA:OMEGA] = np.eye(3) - np.outer(up, up)
         constraint[:, THETA:OMEGA] = -skew(target)
     x, cov = _update(x, cov, constraint, target, np.eye(3) * _STILL_SD ** 2)
-    return folded(x, cov, quat)
+    return folded(x, cov, quat, about)
 
 
-def folded(x: np.ndarray, cov: np.ndarray, quat: np.ndarray) -> Start:
+def _unnoticed(channels, rows, mean, cov, variance):
+    """The largest turn (3,) rad/s about the vertical, in body axes, that does not contradict what
+    the CHANNELs (m,) of a still body measure: ``mean`` (m,), by ``rows`` of a state of mean 0."""
+    force = np.linalg.lstsq(channels["direction"], mean, rcond=None)[0]
+    up = force / np.linalg.norm(force)
+    inward = np.cross(up, np.cross(up, channels["lever"]))
+    inward = np.sum(channels["direction"] * inward, axis=1)
+    weighed = np.linalg.lstsq(rows @ cov @ rows.T + np.diag(variance),
+                              np.column_stack([inward, mean]), rcond=1e-13)[0]
+    information, pull = inward @ weighed
+    if information <= 0.0:
+        return np.zeros(3)
+    square = max(pull / information, 0.0) + _UNNOTICED / np.sqrt(information)
+    return np.sqrt(square) * up
+
+
+def folded(x: np.ndarray, cov: np.ndarray, quat: np.ndarray, about: np.ndarray) -> Start:
     """A Start whose theta is in its quaternion."""
     turn = scipy.spatial.transform.Rotation.from_rotvec(parts(x).theta)
     quat = (scipy.spatial.transform.Rotation.from_quat(quat) * turn).as_quat()
     parts(x).theta[:] = 0.0
-    return Start(x, cov, quat)
+    return Start(x, cov, quat, about)
 
 
 def _agreeing(params, array, start, mean):
@@ -113,7 +134,8 @@ def _agreeing(params, array, start, mean):
     work = make_workspace(array.channels)
     state = State(start.x, start.cov, start.quat, np.array([-1], dtype=np.int64),
                   np.zeros(array.accelerometers, CHECK), np.zeros(1, ADAPTATION),
-                  np.zeros(len(array.channels)), np.zeros(len(array.channels), bool))
+                  np.zeros(len(array.channels)), np.zeros(len(array.channels), bool),
+                  np.zeros((len(start.x), 3)))
     linearise(array.channels, start.x, work)
     cross_check(state, kernel_params(params, array)[0], array.channels, mean, start.x, work)
     return work.use

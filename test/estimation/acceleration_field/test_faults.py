@@ -377,3 +377,44 @@ def test_what_is_not_gravity_is_no_rest():
     with pytest.raises(EstimationError, match="not gravity"):
         AccelerationFieldEstimator(PARAMS.replace(initial=Initial()), layout()).run(
             np.arange(1000) * 1_000_000, readings)
+
+
+@pytest.mark.parametrize("speed, tumbles, said", [
+    (1.7, False, r"do not tell rest, .* about the vertical by up to [23]"),
+    (0.0, False, r"do not tell rest"), (0.0, True, None),
+    (1.7, True, r"turned by some [12].* rad/s about the vertical where it was taken for still"),
+    (-1.7, True, r"turned by some [123].* rad/s about the vertical where it was taken for still")])
+def test_rest_and_a_steady_turn_about_the_vertical_are_told_apart_by_a_later_motion(speed, tumbles,
+                                                                                    said):
+    t = np.arange(1500) * 1e-3
+    moving = tumbles * np.clip((t - 0.7) / 0.1, 0.0, 1.0)[:, None]
+    rate = 8.0 * moving * np.sin(np.outer(t - 0.7, [9.0, 14.0, 11.0]) + [0.3, 0.0, 0.5])
+    rate[:, 2] += speed
+    quat, up = Rotation.identity(), np.empty((len(t), 3))
+    for n in range(len(t)):
+        up[n] = quat.inv().apply([0.0, 0.0, 9.8])
+        quat = quat * Rotation.from_rotvec(1e-3 * rate[n])
+    alpha = np.gradient(rate, 1e-3, axis=0)[:, None]
+    places = PAPER_POSITIONS - CENTRE
+    field = up[:, None] + np.cross(alpha, places) + np.cross(
+        rate[:, None], np.cross(rate[:, None], places))
+    random = np.random.default_rng(1)
+    turned = PAPER_AXES @ Rotation.from_rotvec(0.035 * random.standard_normal((4, 3))).as_matrix()
+    readings = np.einsum("kij,nkj->nki", turned, field)
+    readings += random.normal(0, 0.1, (1, 4, 3)) + random.normal(0, NOISE, readings.shape)
+    estimator = AccelerationFieldEstimator(AccelerationFieldParams(gravity=9.8), layout())
+    estimator.run(np.round(t * 1e9).astype(np.int64), readings)
+    remarks = estimator.remarks()
+    if said is None:
+        assert remarks == []
+    else:
+        assert any(re.search(said, text) for text in remarks), remarks
+
+
+def test_a_given_rate_that_is_wrong_is_named_with_its_error(impact):
+    initial = PARAMS.initial.replace(angular_velocity=(5.0, 4.0, 5.0))
+    remarks = judged(impact, felt(impact), initial=initial)[1]
+    (text,) = [text for text in remarks if "initial.angular_velocity" in text]
+    off = [float(value) for value in re.search(r"\((.*)\) rad/s more", text)[1].split(",")]
+    assert off == pytest.approx([0.0, 1.0, 0.0], abs=0.3)
+    assert judged(impact, felt(impact))[1] == []
