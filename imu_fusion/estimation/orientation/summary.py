@@ -19,7 +19,6 @@ UNITS = {
 """Units of :func:`summary`; what is not named here is a count."""
 
 
-
 def summary(state: np.ndarray, par: np.ndarray, method: str, alignment: Alignment | None,
             counted: Any) -> dict[str, Any]:
     """See OrientationEstimator.summary.
