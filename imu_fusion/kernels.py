@@ -29,7 +29,7 @@ from numba.core import compiler, event, serialize
 from numba.core.caching import _Cache
 from numba.core.registry import cpu_target
 
-NOTICE = "compiling for this machine: about a minute, once after an installation"
+NOTICE = "compiling for this machine: one to four minutes, once after an installation"
 
 _PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+(imu_fusion[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)"
