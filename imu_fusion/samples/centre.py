@@ -12,6 +12,7 @@ _FEWEST = 400      # of these
 _PARTS = 10        # whose scatter tells the standard deviation
 _USUAL = 10.0      # m/s^2, beyond which a force counts less: blows
 _ROUNDS = 3
+_ONE_AXIS = 1e10   # condition, beyond which the body turns about one axis alone
 
 
 class Centre(NamedTuple):
@@ -25,7 +26,7 @@ class Centre(NamedTuple):
 def find_centre(time: np.ndarray, force: np.ndarray, rate: np.ndarray) -> Centre | None:
     """The point whose specific force has least to do with how the body turns: what is felt there
     comes from outside, and turns about in the body's axes, while a centripetal force stands still
-    in them. None of a body that does not tumble.
+    in them. None of a body that does not tumble, or about one axis alone.
 
     Args:
         time: (n,) s. force, rate: (n, 3) m/s^2, rad/s.
@@ -41,6 +42,8 @@ def find_centre(time: np.ndarray, force: np.ndarray, rate: np.ndarray) -> Centre
     for _ in range(_ROUNDS):
         sums = [_normal(arms[part], force[part], weight[part]) for part in parts]
         normal, right = sum(n for n, _ in sums), sum(r for _, r in sums)
+        if not np.linalg.cond(normal) < _ONE_AXIS:
+            return None
         point = np.linalg.solve(normal, right)
         left = np.linalg.norm(force + arms @ point, axis=1)
         weight = 1.0 / (1.0 + (left / _USUAL) ** 2)

@@ -179,7 +179,9 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
     known = params.replace(**{"sensor.gyro_range": None, "initial.start": None})
     found = recover(begun, mag, recovery_params(params))
     result = Smoother(known, surface).run(found.imu, found.mag, fix, velocity)
-    late = {**result.late, "mag": found.mag_lag} if found.mag_lag else result.late
+    late = dict(result.late)
+    if found.mag_lag:    # the smoother may have found more of it
+        late["mag"] = late.get("mag", 0.0) + found.mag_lag
     return replace(result, left_out=len(imu) - len(begun), late=late,
                    start_found=params.initial.start is None)
 

@@ -39,6 +39,13 @@ def test_what_does_not_tumble_has_none(ball):
     assert find_centre(time, force, 0.1 * rate) is None
 
 
+def test_what_rolls_about_one_axis_alone_has_none(ball):
+    """Where on the axis it is, no force tells; without noise the equations are singular."""
+    time, force, rate = ball
+    assert find_centre(time, np.tile([0.0, 0.0, 9.81], (len(time), 1)),
+                       np.outer(5.0 + np.abs(rate[:, 0]), [0.0, 0.0, 1.0])) is None
+
+
 @pytest.mark.parametrize(("lever_arm", "phase", "found"), [
     ((0.0, 0.0, 0.0), "always", True), (-np.array(LEVER_ARM), "always", False),
     (LEVER_ARM, "always", True), ((0.0, 0.0, 0.0), "in_run", False)])
