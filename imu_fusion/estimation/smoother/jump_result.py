@@ -11,9 +11,6 @@ from imu_fusion.surfaces.hill import Hill
 
 _IN_RUN = 10.0   # m before the edge, over which light barriers measure the in-run speed
 
-# Of a length by that of the landing's heights: simulated jumps, errors of many shapes.
-_PER_PROFILE = 1.0
-
 
 @dataclass(frozen=True)
 class JumpResult:
@@ -86,7 +83,8 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
 
     The length is that of the landing profile up to the touch-down; its standard deviation
     joins the position's along the profile, the date's times the speed, and that of the profile,
-    whose errors are no noise: they are the same for all of a landing. The take-off angle
+    whose errors are no noise: they are the same for all of a landing, and move the touch-down by
+    about as much as the heights. The take-off angle
     is that of the velocity at the edge, upwards positive; the in-run speed is the mean over
     the last 10 m before the edge, as light barriers measure it.
 
@@ -118,7 +116,7 @@ def jump_result(hill: Hill, samples: np.ndarray, imu: ImuLog, events: JumpEvents
     forward = hill.axes[0]
     cov_x = np.einsum("i,nij,j->n", forward, samples["cov_position"], forward)
     length_sd = np.hypot(misfit * np.hypot(1.0, slope) * np.hypot(
-        np.sqrt(cov_x[touch]), timing * (forward @ landing)), _PER_PROFILE * profile_sd)
+        np.sqrt(cov_x[touch]), timing * (forward @ landing)), profile_sd)
     edge_timing = np.sqrt(cov_x[edge]) / (forward @ takeoff)
     takeoff_speed, landing_speed = np.linalg.norm(takeoff), np.linalg.norm(landing)
     horizontal = np.hypot(*takeoff[:2])

@@ -17,9 +17,8 @@ from imu_fusion.estimation.smoother.records import CONTACT, make_scratch
 from imu_fusion.estimation.smoother.state import ATT, POS, boxplus
 from imu_fusion.estimation.smoother.transition import apply_step
 
-# Turns, bounds and odds were chosen on balls of this package's simulation. Of 59 that another one
-# lost in gaps and bursts, 52 were found to 60 deg; of 4 with such odds none was wrong, of 7 with
-# e^10 one. Sixteen turns, or a bound of .4 or 1.2 rad, found no more.
+# Turns and bounds were chosen on balls of this package's simulation, and tried on those of another:
+# twice as many turns, or another bound, found no more. The odds were chosen on these.
 _TOGETHER = 16     # samples over which one linearisation of the surface holds
 _LOST = 0.7        # rad, standard deviation of an attitude from which the turn about the field is
 _HELD = 0.35       # lost, whatever is stated later; turns are tried once the field holds the others

@@ -31,8 +31,8 @@ def on_a_vehicle(seed):
     return imu, truth
 
 
-@pytest.mark.parametrize("told, mode", [(VEHICLE, "causal"), (PHONE_GRADE, "smoothed")],
-                         ids=["preset", "sensors only"])
+@pytest.mark.parametrize("told, mode", [
+    (VEHICLE, "causal"), (PHONE_GRADE, "causal"), (PHONE_GRADE, "smoothed")])
 def test_tilt_on_a_vehicle_is_as_good_as_stated(told, mode):
     """Told of the motion, or finding out. Errors last for tens of seconds: one vehicle's mean
     scatters by 0.6, that of ten by 0.2; bounds are three of these."""
