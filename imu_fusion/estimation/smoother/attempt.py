@@ -329,7 +329,7 @@ def _result(problem: Problem, frame: LocalFrame, hill: Hill | None, solution: So
     return SmootherResult(samples, frame, states, innovations, tuple(problem.cost),
                           solution.steps, solution.converged, solution.events, jump, fits,
                           residuals=residuals, wander=wander, near_ground=near, failure=failure,
-                          lost_turns=tuple(problem.lost_turns), centre=other_centre(problem),
+                          lost_turns=tuple(problem.lost_turns),
                           log_likelihood=log_density(problem.readings)
                           - solution.last.surprise)
 
