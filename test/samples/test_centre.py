@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_fusion.estimation.smoother import SmootherParams
+from imu_fusion.estimation.smoother import Smoother, SmootherParams, hypotheses
 from imu_fusion.estimation.smoother.attempt import other_centre
 from imu_fusion.samples.centre import find_centre
 from imu_fusion.samples.logs import ImuLog
@@ -59,3 +59,13 @@ def test_the_smoother_is_told_another_one(ball, lever_arm, phase, found):
     centre = other_centre(SimpleNamespace(
         params=params, constraints=holds, imu=SimpleNamespace(log=log)))
     assert (centre is not None) == found
+
+
+def test_a_result_says_where_it_is(monkeypatch):
+    n = 200
+    imu = ImuLog(np.arange(n) * 10_000_000, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)))
+    monkeypatch.setattr(hypotheses, "other_centre", lambda problem: np.array([0.0, 0.031, -0.012]))
+    result = Smoother(SmootherParams().replace(**{
+        "initial.position": (47.0, 11.0, 800.0), "initial.position_sd": 0.1})).run(imu)
+    (text,) = [text for text in result.remarks() if "surface.lever_arm" in text]
+    assert "[0.000, 0.031, -0.012] m" in text
