@@ -1,7 +1,12 @@
 """Nodes that join a session, leave it, vanish and come back; see imu_fusion/nodes/flow."""
 
+import pytest
+from rclpy.node import Node
+
 from imu_fusion.nodes.flow import END, source
+from imu_fusion.nodes.flow.peers import Peer
 from imu_fusion.nodes.flow.qos import sensor_qos
+from imu_fusion.nodes.flow.source import Output
 from imu_fusion.nodes.flow.state import MARK
 from test.nodes.flow_parts import Doubler, Receiver, Sender, twice
 
@@ -205,3 +210,26 @@ def test_node_between_answers_anew_when_its_sender_has_discovered_more(graph):
     hidden[0] = False
     graph.until(lambda: receiver.ended)
     assert receiver.values == twice(100) and not receiver.flow.problems
+
+
+def no_readers_of_the_sender(node, topic, known=Node.get_subscriptions_info_by_topic):
+    return [] if node.get_name() == "sender" else known(node, topic)
+
+
+@pytest.mark.parametrize("unknown", [
+    (Output, "matched", lambda output: 0), (Peer, "is_silent", property(lambda peer: True)),
+    (Node, "get_subscriptions_info_by_topic", no_readers_of_the_sender)],
+    ids=["readers not matched", "a peer not heard", "readers not in the graph"])
+def test_nothing_leaves_before_all_that_is_there_is_known(graph, monkeypatch, unknown):
+    """Between processes discovery takes its time; here it is held up."""
+    receiver, sender = Receiver(graph), Sender(graph, wait_for=["receiver"])
+    with monkeypatch.context() as held_up:
+        held_up.setattr(*unknown)
+        sender.session(3)
+        graph.until(lambda: receiver.flow.sink.sessions and not sender.source._awaited
+                    and not sender.source._is_settling())
+        turns = iter(range(20))    # in which it would begin
+        graph.until(lambda: next(turns, None) is None)
+        assert sender.out.sent == 0 and sender.source.waiting_for()
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == [0, 1, 2]
