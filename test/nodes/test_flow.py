@@ -1,7 +1,7 @@
 """Sessions between nodes of this process; see imu_fusion/nodes/flow."""
 
 import rclpy
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64, String
 
 from imu_fusion.nodes.flow import END, NEXT, sink, source
@@ -127,6 +127,26 @@ def test_foreign_subscriber_is_named_and_never_waited_for(graph):
     graph.until(lambda: receiver.ended)
     assert sender.source.foreign == {"/numbers": ["/stranger"]}
     assert receiver.values == list(range(2000))
+
+
+def test_subscribers_that_can_never_be_matched_are_not_waited_for(graph):
+    """Of another type, or asking for what was sent before they came."""
+    elsewhere = rclpy.Context()    # one participant has one type for a topic
+    rclpy.init(context=elsewhere)
+    other, late = rclpy.create_node("other", context=elsewhere), graph.node("late")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    other.create_subscription(String, "/numbers", lambda message: None, 10)
+    late.create_subscription(Int64, "/numbers", lambda message: None, latched)
+    receiver, sender = Receiver(graph), Sender(graph)
+    try:
+        graph.until(lambda: sender.node.count_subscribers("/numbers") == 3)
+        sender.session(3)
+        graph.until(lambda: receiver.ended)
+    finally:
+        other.destroy_node()
+        rclpy.shutdown(context=elsewhere)
+    assert receiver.values == [0, 1, 2]
+    assert sender.source.foreign == {"/numbers": ["/late", "/other"]}
 
 
 def test_foreign_subscriber_that_takes_nothing_does_not_stop_a_session(graph):

@@ -54,7 +54,9 @@ class Output:
             node.get_publishers_info_by_topic, self.topic,
             lambda: node.create_publisher(self.msg_type, self.name, qos, event_callbacks=SILENT),
             self._source.peers.participant)
-        self.qos = qos
+        # As the graph shows it: in one's own an unlimited deadline is 0, which suits no reader.
+        self.qos = next(info.qos_profile for info in node.get_publishers_info_by_topic(self.topic)
+                        if gid(info) == self.writer)
         self.sent = self.start = self.bytes = 0
         self._flight = self._flight_bytes = 0
 
@@ -334,8 +336,10 @@ class Source:
             if {j.topics[topic].reader for j in self._answers().values()
                     if topic in j.topics and not j.finished} - set(map(gid, infos)):
                 return False
-            compatible = sum(qos_check_compatible(output.qos, i.qos_profile)[0]
-                             != QoSCompatibility.ERROR for i in infos)
+            compatible = sum(
+                i.topic_type == type_name(output.msg_type)
+                and qos_check_compatible(output.qos, i.qos_profile)[0] != QoSCompatibility.ERROR
+                for i in infos)
             if output.matched() < compatible:
                 return False
         return True
