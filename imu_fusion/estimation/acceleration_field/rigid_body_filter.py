@@ -144,11 +144,12 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exa
     p = par[0]
     step = _make_step()
     at = np.empty_like(state.x)
-    only = np.int64(0)   # a literal 0 would compile what is called once more
+    # Literals would compile what is called once more.
+    only, yes = np.int64(0), np.bool_(True)
     for n in range(len(stamp)):
         flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
         at[:] = state.x
-        found = _correct(state, p, channels, readings[n], at, True, True, step, work, trace, only)
+        found = _correct(state, p, channels, readings[n], at, yes, yes, step, work, trace, only)
         _fold(state)
         if found.learnt:
             ask(exact, state.x, state.cov)
@@ -192,12 +193,12 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work):
     p = par[0]
     step = _make_step()
     where = np.empty_like(state.x)
-    likelihood = 0.0
+    likelihood, no = 0.0, np.bool_(False)
     for n in range(len(stamp)):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
         predicted = len(at) == 0
         where[:] = state.x if predicted else at[n]
-        likelihood += _correct(state, p, channels, readings[n], where, predicted, False, step, work,
+        likelihood += _correct(state, p, channels, readings[n], where, predicted, no, step, work,
                                trace, n).log_likelihood
         trace.x[n] = state.x
         trace.cov[n] = state.cov
