@@ -57,7 +57,11 @@ from imu_fusion.estimation.acceleration_field.params import AccelerationFieldPar
 from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_rigid_row
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
-from imu_fusion.estimation.acceleration_field.wrong_start import fit_start, move_on
+from imu_fusion.estimation.acceleration_field.wrong_start import (
+    doubt_of_start,
+    fit_start,
+    move_on,
+)
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 from imu_fusion.kernels import njit
 
@@ -144,11 +148,12 @@ def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exa
     p = par[0]
     step = _make_step()
     at = np.empty_like(state.x)
-    only = np.int64(0)   # a literal 0 would compile what is called once more
+    # Literals would compile what is called once more.
+    only, yes = np.int64(0), np.bool_(True)
     for n in range(len(stamp)):
         flags = _predict_to(stamp[n], state, p, channels, step, trace, only)
         at[:] = state.x
-        found = _correct(state, p, channels, readings[n], at, True, True, step, work, trace, only)
+        found = _correct(state, p, channels, readings[n], at, yes, yes, step, work, trace, only)
         _fold(state)
         if found.learnt:
             ask(exact, state.x, state.cov)
@@ -169,9 +174,10 @@ def _put(row, p, channels, state, exact):
     """Fill a ROW by the State, moved to where the hypothesis that the mounting is exact has it, as
     far as that counts; that much further its mean may be off."""
     cov, part = widening(state.x, channels) * state.cov[:BIAS, :BIAS], share(exact)
-    s = parts(state.x)
+    s, doubt = parts(state.x), np.empty(BIAS)
+    doubt_of_start(state, doubt)
     if part == 0.0:
-        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc, cov)
+        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc, cov, doubt)
         return
     change = part * change_of(exact, state.cov)
     for i in range(BIAS):
@@ -179,7 +185,7 @@ def _put(row, p, channels, state, exact):
             cov[i, j] += change[i] * change[j]
     d = parts(change)
     put_rigid_row(row, p, quat_normalize(quat_multiply(state.quat, quat_exp(d.theta))),
-                  s.omega + d.omega, s.alpha + d.alpha, s.acc + d.acc, cov)
+                  s.omega + d.omega, s.alpha + d.alpha, s.acc + d.acc, cov, doubt)
 
 
 @njit
@@ -193,12 +199,12 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work):
     step = _make_step()
     where = np.empty_like(state.x)
     likelihood = 0.0
+    predicted, causal = np.bool_(len(at) == 0), np.bool_(False)
     for n in range(len(stamp)):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
-        predicted = len(at) == 0
         where[:] = state.x if predicted else at[n]
-        likelihood += _correct(state, p, channels, readings[n], where, predicted, False, step, work,
-                               trace, n).log_likelihood
+        likelihood += _correct(state, p, channels, readings[n], where, predicted, causal, step,
+                               work, trace, n).log_likelihood
         trace.x[n] = state.x
         trace.cov[n] = state.cov
         _fold(state)
