@@ -252,10 +252,22 @@ def swings(size, r, rng):
     return _with(r, mag=r.mag.mag + size * np.sin(2.0 * np.pi * (0.7 * time + rng.random(3))))
 
 
-def stuck(r, rng):
-    """Magnetometer that repeats its last sample from half-way on."""
-    half = len(r.mag) // 2
-    return _with(r, mag=np.vstack([r.mag.mag[:half], np.tile(r.mag.mag[half], (len(r.mag) - half, 1))]))
+def stuck(sensor, r, rng):
+    """A sensor that repeats its last sample from half-way on."""
+    if sensor == "mag":
+        return _with(r, mag=_repeated(r.mag.mag))
+    return _with(r, **{sensor: _repeated(getattr(r.imu, sensor))})
+
+
+def _repeated(values):
+    half = len(values) // 2
+    return np.vstack([values[:half], np.tile(values[half], (len(values) - half, 1))])
+
+
+def held(rate, r, rng):
+    """Magnetometer at a lower rate, its last value in every message between."""
+    step = max(int(round((len(r.mag) - 1) / _duration(r) / rate)), 1)
+    return _with(r, mag=r.mag.mag[np.arange(len(r.mag)) // step * step])
 
 
 CHANGES = {
@@ -302,7 +314,10 @@ CHANGES = {
     "magnetometer turned by 5 deg": (partial(turned_magnetometer, 5.0), True),
     "hard iron of 20 uT from half-way on": (partial(comes_later, 20e-6), True),
     "magnet of 10 uT that swings": (partial(swings, 10e-6), True),
-    "magnetometer stuck from half-way on": (stuck, True),
+    "magnetometer at 10 Hz, repeated between": (partial(held, 10.0), True),
+    "magnetometer stuck from half-way on": (partial(stuck, "mag"), True),
+    "gyroscope stuck from half-way on": (partial(stuck, "gyr"), False),
+    "accelerometer stuck from half-way on": (partial(stuck, "acc"), False),
 }
 """What is changed: a function of a Recording and a generator, and whether it needs a magnetometer."""
 

@@ -66,6 +66,15 @@ def _car_with_share(estimator):
     return f"{_car(estimator)} ({_car(estimator, 'within 3 sigma')})"
 
 
+def _set(name, mode, column="ours"):
+    return Figure("orientation_sets", f"{name} | {_trials(name)} | {mode}", column, _FIRST)
+
+
+def _trials(name):
+    lines = (RESULTS / "orientation_sets.md").read_text().splitlines()
+    return next(line.split(" | ")[1] for line in lines if line.startswith(f"| {name} |"))
+
+
 def _impact(method):
     return Figure("acceleration_field_independent", "10", method, _FIRST)
 
@@ -87,6 +96,14 @@ def rows():
         ("The same, gyroscopes cut off at 300 deg/s (24.3 % of the samples): RMS, deg",
          f"{_clipped('fusion, causal')} live, {_clipped('fusion, smoothed')} smoothed",
          f"OfflineVQF {_clipped('OfflineVQF')}", "orientation_clipping"),
+        *((f"The same defaults on {what}: RMS, deg",
+           f"{_set(name, 'causal')} live, {_set(name, 'smoothed')} smoothed",
+           "VQF {}, OfflineVQF {}".format(*(
+               _set(name, mode, "peer: total / inclination / heading, deg")
+               for mode in ("causal", "smoothed"))), "orientation_sets")
+          for what, name in (("a kinematic chain in a building (DIODEM)", "DIODEM"),
+                             ("phones that are carried", "phones, no magnets"),
+                             ("a robot arm, no magnetometer", "OpenAXES, no magnetometer"))),
         ("Tilt of a car without GNSS: RMS, deg (share within 3 stated sigma)",
          f"vehicle preset, live {_car_with_share('fusion, orientation_vehicle.yaml, causal')}; "
          f"defaults {_car_with_share('fusion, causal')}",

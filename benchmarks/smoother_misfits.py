@@ -1,11 +1,15 @@
-"""What the smoother does where data are not as its model has them: python -m benchmarks.smoother_misfits
+"""What the smoother does where data are not as its model has them.
 
-Each situation is estimated as a user would, with the defaults, and judged against a truth: the
-error, what is stated of it, and whether a remark says that something is wrong. Simulated ones are
-repeated with other noise; the drive is real, and its truth the RTK fixes that were withheld.
+    python -m benchmarks.smoother_misfits [ROW ...]
+
+Rows that are named are put in the place of those of before; else all are run. Each situation is
+estimated as a user would, with the defaults, and judged against a truth: the error, what is stated
+of it, and whether a remark says that something is wrong. Simulated ones are repeated with other
+noise; the drive is real, and its truth the RTK fixes that were withheld.
 """
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -13,7 +17,7 @@ import numpy as np
 
 from benchmarks import smoother_drive
 from benchmarks.smoother_speed import FRAME, drive
-from benchmarks.table import write_table
+from benchmarks.table import lines_of_last_run, write_table
 from imu_fusion.errors import ImuFusionError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.points import at_antenna
@@ -162,10 +166,12 @@ def withheld(row):
 
 
 def walks(outages: bool, with_velocity: bool = True,
-          change: Callable = lambda fix, velocity: (fix, velocity), **errors) -> Callable:
-    """Walks of 134 s with fixes and velocities changed; error of the antenna in the middle of the
-    recording without fixes for three times 15 s, or over all of it."""
-    own = WalkErrors(**errors)
+          change: Callable = lambda fix, velocity: (fix, velocity), lever=(0.0, 0.0, 0.0),
+          **errors) -> Callable:
+    """Walks of 134 s with fixes and velocities changed, and an antenna said to be at ``lever``;
+    error of the antenna in the middle of the recording without fixes for three times 15 s, or over
+    all of it."""
+    own, params = WalkErrors(**errors), DEFAULTS.replace(**{"gnss.lever_arm": lever})
 
     def run(row):
         for seed in range(WALKS):
@@ -177,9 +183,9 @@ def walks(outages: bool, with_velocity: bool = True,
             hold = outages & (((t - 40.0) % 30.0 < 15.0) & (t > 40.0) & (t < 115.0))
             if outages:
                 changed = tuple(log[~hold] for log in changed)
-            result = Smoother(DEFAULTS).run(recorded.imu, recorded.mag, changed[0],
+            result = Smoother(params).run(recorded.imu, recorded.mag, changed[0],
                                             changed[1] if with_velocity else None)
-            samples = at_antenna(result.samples, result.states, DEFAULTS)
+            samples = at_antenna(result.samples, result.states, params)
             since = (samples["stamp"] - recorded.imu.stamp[0]) * 1e-9
             scored = np.searchsorted(since, t[hold] if outages else t)
             lever = np.array(own.lever_arm)
@@ -203,6 +209,18 @@ def holding(fix, velocity):
     held = np.arange(len(fix))
     held[250:350] = 250
     return tuple(replace(log[held], stamp=log.stamp) for log in (fix, velocity))
+
+
+def drifting(rate):
+    """A receiver whose clock runs faster, and was right at the beginning."""
+    def change(*logs):
+        return tuple(replace(log, stamp=log.stamp + np.round(
+            rate * (log.stamp - log.stamp[0])).astype(np.int64)) for log in logs)
+    return change
+
+
+def in_feet(fix, velocity):
+    return replace(fix, height=fix.height / 0.3048), velocity
 
 
 def twice(fix, velocity):
@@ -264,6 +282,26 @@ SITUATIONS = (
     ("the same, the receiver holds its last for 20 s", "5.6 m off, stated .37",
      walks(False, change=holding)),
     ("the same, each fix twice, .1 s apart", "NEES 9.5", walks(False, change=twice)),
+    ("walk, RTK 5 Hz, antenna 0.5 m above the sensor, given with the other sign", "",
+     walks(False, lever=(-0.1, -0.1, -0.5), lever_arm=(0.1, 0.1, 0.5))),
+    ("the same, given in front-right-down axes", "",
+     walks(False, lever=(0.1, -0.1, -0.5), lever_arm=(0.1, 0.1, 0.5))),
+    ("the same, x and z exchanged", "",
+     walks(False, lever=(0.5, 0.1, 0.1), lever_arm=(0.1, 0.1, 0.5))),
+    ("walk, RTK 5 Hz, the receiver's clock 1,000 millionths fast", "",
+     walks(False, change=drifting(1e-3))),
+    ("the same, 5,000 millionths slow", "", walks(False, change=drifting(-5e-3))),
+    ("the same, fixes alone", "", walks(False, False, drifting(-5e-3))),
+    ("walk, RTK 5 Hz, heights in feet", "", walks(False, change=in_feet)),
+    ("walk, fixes of 1 m that wander over 30 s, 10 Hz", "", walks(
+        False, gnss_rate=10.0, stated_sd=(1.0, 1.0, 1.5), gnss=GnssErrors(
+            position_sd=(1.0, 1.0, 1.5), position_tau=30.0, velocity_sd=(0.1, 0.1, 0.2)))),
+    ("walk, fixes of 3 m that wander over 100 s, 10 Hz", "", walks(
+        False, gnss_rate=10.0, stated_sd=(3.0, 3.0, 4.5), gnss=GnssErrors(
+            position_sd=(3.0, 3.0, 4.5), position_tau=100.0, velocity_sd=(0.1, 0.1, 0.2)))),
+    ("the same, 1 Hz", "", walks(
+        False, gnss_rate=1.0, stated_sd=(3.0, 3.0, 4.5), gnss=GnssErrors(
+            position_sd=(3.0, 3.0, 4.5), position_tau=100.0, velocity_sd=(0.1, 0.1, 0.2)))),
     ("walk, 1 Hz, fixes of stated 4 m that wander by 3 m", "", walks(False, **PHONE)),
     ("the same, past iron that bends the field by 20 uT", "",
      walks(False, **PHONE, iron=20e-6, iron_length=2.0)),
@@ -272,21 +310,23 @@ SITUATIONS = (
     ("real drive, defaults: 11 x 15 s without fixes", "NEES 16-25 (a walk)", withheld),
     ("real drive, wandering receiver, 4 Hz", "", car(1, True)),
     ("real drive, wandering receiver, 1 Hz", "7.7 m off, stated 1.9", car(4, True)),
-    ("the same, no velocities", "", car(4, False)),
+    ("real drive, wandering receiver, 1 Hz, no velocities", "", car(4, False)),
 )
 
 
-def main():
-    rows = []
+def main(wanted: Sequence[str] = ()) -> None:
+    rows = {cells[0]: cells for cells in lines_of_last_run("smoother_misfits")} if wanted else {}
     for name, before, run in SITUATIONS:
+        if wanted and name not in wanted:
+            continue
         row = Row(name, before)
         run(row)
-        rows.append(row.cells())
-        print(" | ".join(map(str, rows[-1])), flush=True)
+        rows[name] = row.cells()
+        print(" | ".join(map(str, rows[name])), flush=True)
     write_table(
         "smoother_misfits",
         ("situation", "runs", "error m, RMS", "stated m", "NEES", "within 3 sigma",
-         "remarks", "before"), rows,
+         "remarks", "before"), [rows[name] for name, _, _ in SITUATIONS if name in rows],
         "Defaults, `gravity` of the simulation. Error and stated: of the position, all three axes, "
         "over all samples (drive: at fixes). Wrong and silent: a run whose RMS error is beyond "
         f"three stated standard deviations without a remark. Wandering receiver: {WANDER_SD[0]:g} "
@@ -295,4 +335,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -43,7 +43,9 @@ _FRAMES = (
     ("reversed", -np.eye(3)))
 _UNITS = (("", 1.0), ("in km/h, not m/s; divide by 3.6", 3.6),
           ("in knots, not m/s; multiply by 0.514444", 1.0 / 0.514444),
-          ("in mph, not m/s; multiply by 0.44704", 1.0 / 0.44704))
+          ("in mph, not m/s; multiply by 0.44704", 1.0 / 0.44704),
+          ("in ft/s, not m/s; multiply by 0.3048", 1.0 / 0.3048),
+          ("in cm/s, not m/s; divide by 100", 100.0), ("in mm/s, not m/s; divide by 1000", 1e3))
 
 
 class _Spans(NamedTuple):

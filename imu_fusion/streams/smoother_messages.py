@@ -76,7 +76,7 @@ class Outcome:
             "converged": result.converged, "cost": float(result.cost[-1]),
             "misfit": result.misfit(), "wander": result.wander, "gnss_lag": result.gnss_lag,
             "velocity_lag": result.velocity_lag, "late": result.late,
-            "repeats": result.repeats,
+            "clock_rate": result.clock_rate, "repeats": result.repeats,
             "adapted": result.adapted, "noise": result.noise,
             "acc_density": result.acc_density, "left_out": result.left_out,
             "rests": [[rest.first, rest.last] for rest in result.rests],

@@ -6,7 +6,7 @@ from std_msgs.msg import Int64, String
 
 from imu_fusion.nodes.flow import END, NEXT, sink, source
 from imu_fusion.nodes.flow.qos import sensor_qos, session_qos
-from imu_fusion.nodes.flow.source import WINDOW
+from imu_fusion.nodes.flow.source import WINDOW, Output
 from test.nodes.flow_parts import Doubler, Part, Receiver, Sender, twice
 
 
@@ -147,6 +147,25 @@ def test_subscribers_that_can_never_be_matched_are_not_waited_for(graph):
         rclpy.shutdown(context=elsewhere)
     assert receiver.values == [0, 1, 2]
     assert sender.source.foreign == {"/numbers": ["/late", "/other"]}
+
+
+def test_a_subscriber_that_stays_unmatched_keeps_a_session_for_a_while_only(graph, monkeypatch):
+    """It suits by its QoS, and the middleware does not join them: e.g. of another partition."""
+    receiver, sender = Receiver(graph), Sender(graph)
+    stranger = graph.node("stranger")
+    stranger.create_subscription(Int64, "/numbers", lambda message: None, 10)
+    matched = Output.matched
+    monkeypatch.setattr(Output, "matched", lambda output: matched(output) - 1)
+    monkeypatch.setattr(source, "MATCHING", 1e9)
+    graph.until(lambda: sender.node.count_subscribers("/numbers") == 2)
+    sender.session(3)
+    graph.until(lambda: sender.source.phase and not sender.source._is_settling())
+    turns = iter(range(20))    # in which it would begin
+    graph.until(lambda: next(turns, None) is None)
+    assert sender.out.sent == 0
+    monkeypatch.setattr(source, "MATCHING", 0.0)
+    graph.until(lambda: receiver.ended)
+    assert receiver.values == [0, 1, 2]
 
 
 def test_foreign_subscriber_that_takes_nothing_does_not_stop_a_session(graph):

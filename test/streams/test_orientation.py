@@ -89,3 +89,14 @@ def test_samples_at_the_magnetometer_s_limit_do_not_bend_its_calibration(values)
         list(stream.use({MAG_TOPIC: (stamps[part], mag[part])}))
     found = stream.calibrate_magnetometer()
     assert found.offset == pytest.approx([50e-6 * scale, 0.0, -5e-6 * scale], abs=4e-7 * scale)
+
+
+def test_samples_left_out_before_the_start_are_counted():
+    said = []
+    params = OrientationParams.from_mapping({"mode": "smoothed", "alignment.start": 2.0})
+    stream = OrientationStream(params, warn=said.append)
+    stamps = 10_000_000 * np.arange(500)
+    list(stream.use({IMU_TOPIC: (stamps, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (500, 1)))}))
+    rows = sum(len(part.stamp) for part in stream.flush() if part.topic == ORIENTATION_TOPIC)
+    assert len(said) == 1 and said[0].startswith(f"{500 - rows} Imu samples before the rest")
+    assert rows == 300

@@ -198,13 +198,13 @@ def trace_samples(state, par, channels, stamp, readings, at, trace, work):
     p = par[0]
     step = _make_step()
     where = np.empty_like(state.x)
-    likelihood = 0.0
-    predicted, causal = np.bool_(len(at) == 0), np.bool_(False)
+    likelihood, no = 0.0, np.bool_(False)
     for n in range(len(stamp)):
         _predict_to(stamp[n], state, p, channels, step, trace, n)
+        predicted = len(at) == 0
         where[:] = state.x if predicted else at[n]
-        likelihood += _correct(state, p, channels, readings[n], where, predicted, causal, step,
-                               work, trace, n).log_likelihood
+        likelihood += _correct(state, p, channels, readings[n], where, predicted, no, step, work,
+                               trace, n).log_likelihood
         trace.x[n] = state.x
         trace.cov[n] = state.cov
         _fold(state)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_fusion.estimation.orientation.mag_repeats import REPEATS, is_stale
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
 from imu_fusion.kernels import njit
 from imu_fusion.sensors.saturation import saturated_axes
@@ -187,16 +188,16 @@ def search(iron: np.ndarray, stamps: np.ndarray, gyr: np.ndarray, limits: np.nda
     lost = (saturated_axes(gyr, limits).any(axis=1)
             | (np.diff(stamps, prepend=stamps[:1]) > params.gap.max * 1e9))
     tried = iron[:1].copy()
-    found = bool(_search(tried, stamps, gyr - bias, lost, mag_stamps, mags,
-                         params.fusion.mag_offset_sd))
+    found = bool(_search(tried, np.zeros(1, REPEATS), stamps, gyr - bias, lost, mag_stamps, mags,
+                         params.sensor.mag_noise_sd, params.fusion.mag_offset_sd))
     iron[:] = tried
     return found
 
 
 @njit
-def _search(tried, stamps, gyr, lost, mag_stamps, mags, stated_sd):
-    """See :func:`search`. lost: (n,) whether how the sensor turned in the step before a sample is
-    not known."""
+def _search(tried, repeats, stamps, gyr, lost, mag_stamps, mags, noise_sd, stated_sd):
+    """See :func:`search`. repeats: (1,) REPEATS, zeros. lost: (n,) whether how the sensor turned in
+    the step before a sample is not known."""
     iron = tried[0]
     quat = (0.0, 0.0, 0.0, 1.0)
     j = 0
@@ -206,7 +207,9 @@ def _search(tried, stamps, gyr, lost, mag_stamps, mags, stated_sd):
         while j < len(mags) and mag_stamps[j] < stamps[i]:
             if mag_stamps[j] >= stamps[i - 1] and not lost[i]:
                 turn = quat_exp(gyr[i - 1], (mag_stamps[j] - stamps[i - 1]) * 1e-9)
-                add(iron, mag_stamps[j], quat_multiply(quat, turn), mags[j])
+                then = quat_multiply(quat, turn)
+                if not is_stale(repeats[0], mag_stamps[j], mags[j], then, noise_sd):
+                    add(iron, mag_stamps[j], then, mags[j])
             j += 1
         mean = (0.5 * (gyr[i - 1, 0] + gyr[i, 0]), 0.5 * (gyr[i - 1, 1] + gyr[i, 1]),
                 0.5 * (gyr[i - 1, 2] + gyr[i, 2]))

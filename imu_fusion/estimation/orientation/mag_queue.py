@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from imu_fusion.estimation.orientation import mag_rejection, rotation_history
+from imu_fusion.estimation.orientation.mag_repeats import is_stale
 from imu_fusion.estimation.orientation.state import QUEUE_LENGTH
 from imu_fusion.kernels import njit
 
@@ -33,6 +34,9 @@ def push(s, p, stamp, mag):
             calibrated[i] += matrix[3 * i + j] * (mag[j] - offset[j])
     if mag_rejection.is_no_field(calibrated):
         s.counts.mag_rejected += 1
+        return
+    if is_stale(s.mag_repeats, stamp, calibrated, s.history.quat, p.sensor.mag_noise_sd):
+        s.counts.mag_repeated += 1
         return
     if queue.count == QUEUE_LENGTH:
         # A magnetometer far faster than the Imu.

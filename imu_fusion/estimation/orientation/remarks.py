@@ -9,6 +9,7 @@ from imu_fusion.estimation.orientation import wander
 # hypothesis expects. Chosen between recordings made 8 % worse and those of the sets as they are,
 # of which a phone in a runner's pocket gets to 5.6 %.
 _FAR_OFF = 12.0
+_STUCK = 5_000_000_000     # ns of one value: no magnetometer is as slow
 
 
 def remarks(state: np.ndarray, par: np.ndarray, realigned: int, blind: bool = False) -> list[str]:
@@ -49,6 +50,11 @@ def remarks(state: np.ndarray, par: np.ndarray, realigned: int, blind: bool = Fa
             + ("was taken off" if (iron["taken_off"] == iron["offset"]).all() else
                "was found after the start: the heading may be off by what it does to the needle")
             + "; calibrate it (imu_fusion calibrate magnetometer) or set sensor.mag_offset")
+    stuck = int(state["mag_repeats"]["longest"])
+    if stuck > _STUCK:
+        found.append(
+            f"the magnetometer repeated one value for {stuck * 1e-9:.0f} s while the body turned: "
+            "stuck, and not used meanwhile; look at its driver, or leave it out")
     if state["wander"]["overall"][wander.TILT] > wander.LOST:
         found.append(
             "field, forces and rates contradict each other by far more than their stated "

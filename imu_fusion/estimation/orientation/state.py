@@ -10,6 +10,7 @@ import numpy as np
 
 from imu_fusion.estimation.orientation.error_state import PREDICTION, ROW, N
 from imu_fusion.estimation.orientation.hard_iron import HARD_IRON
+from imu_fusion.estimation.orientation.mag_repeats import REPEATS
 from imu_fusion.samples.flat_tops import FLAT_TOPS
 
 HISTORY_LENGTH = 256  # rotations kept: 0.25 s at 1 kHz, more than the largest delay and latency
@@ -97,11 +98,12 @@ STEP = np.dtype([
 """What the newest Imu sample brought: between the parts of one step of the fusion filter."""
 
 COUNT_NAMES = ("imu_used", "imu_rejected", "mag_used", "mag_rejected", "mag_late", "mag_disturbed",
-               "mag_saturated", "gaps", "saturated", "rates_held", "forces_held", "realigned")
+               "mag_saturated", "mag_repeated", "gaps", "saturated", "rates_held", "forces_held",
+               "realigned")
 COUNTS = np.dtype([(name, "i8") for name in COUNT_NAMES], align=True)
 """What became of the samples: used; refused as impossible, out of order or too many; too late;
-disturbed; with an axis at its limit; steps with a gap; Imu samples at a limit; rates and forces
-held; rests that refuted bias and attitude."""
+disturbed; with an axis at its limit; repeated while the body turned; steps with a gap; Imu
+samples at a limit; rates and forces held; rests that refuted bias and attitude."""
 
 EQUATION = np.dtype([
     ("rate", "f8", 3), ("rate_next", "f8", 3),   # rad/s at both ends, each in its own imu axes
@@ -141,6 +143,7 @@ STATE = np.dtype([
     ("hard_iron", HARD_IRON),            # of a magnetometer that nobody has calibrated
     ("iron_shown", "?"),                 # a window of it ended with the newest Imu sample
     ("mag_limit", FLAT_TOPS),            # the search for the magnetometer's range (mag_rejection)
+    ("mag_repeats", REPEATS),            # and for samples that are old ones (mag_repeats)
     ("gyro_limit", FLAT_TOPS),           # and the gyroscope's (gyro_limit)
     ("gyro_spike", SPIKE),
     ("acc_spike", SPIKE),

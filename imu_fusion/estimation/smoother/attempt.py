@@ -73,6 +73,16 @@ class Given(NamedTuple):
             velocity=None if velocity is None else replace(
                 velocity, stamp=velocity.stamp - np.int64(round(of_velocities * 1e9))))
 
+    def with_clock(self, rate: float) -> "Given":
+        """With stamps of a receiver whose clock runs faster by a rate, and is right in the middle
+        of the recording."""
+        middle = (self.imu.stamp[0] + self.imu.stamp[-1]) // 2
+
+        def in_time(log):
+            return log if log is None or not rate else replace(log, stamp=log.stamp - np.round(
+                (log.stamp - middle) * (rate / (1.0 + rate))).astype(np.int64))
+        return self._replace(fix=in_time(self.fix), velocity=in_time(self.velocity))
+
 
 class Model(NamedTuple):
     """What is taken to be true of a recording: ``params``; ``step_at``, stamp (ns) of the first
@@ -81,7 +91,8 @@ class Model(NamedTuple):
     exactly are measurements; ``stands``: whether a jumper stands after the touch-down, so that the
     sensor is at its height above the profile; ``profile``: an error of the landing profile, which
     counts as much less as that is beyond chance; ``late``: "gyr" or "mag" -> s, by which these are
-    later than the accelerometer; ``rests``; None: those that the recording shows."""
+    later than the accelerometer; ``clock_rate``, by which the receiver's clock runs faster than
+    that of the Imu; ``rests``; None: those that the recording shows."""
 
     params: SmootherParams
     step_at: int | None = None
@@ -91,6 +102,7 @@ class Model(NamedTuple):
     late: Mapping[str, float] = {}
     rests: tuple[Rest, ...] | None = None
     profile: ProfileError = ProfileError()
+    clock_rate: float = 0.0
 
     def changed(self, changes: Mapping[str, Any]) -> "Model":
         """With other values of parameters, by their dotted names."""
@@ -111,7 +123,7 @@ def attempt(given: Given, model: Model, surface: Surface | None) -> Attempt:
     """
     params = model.params
     imu, mag = in_time(given.imu, given.mag, model.late)
-    given = given._replace(mag=mag)
+    given = given._replace(mag=mag).with_clock(model.clock_rate)
     prepared = prepare_imu(imu, params)
     first = first_place(given.fix, params.initial.position)
     frame = reference_frame(surface, first)

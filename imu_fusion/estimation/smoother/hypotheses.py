@@ -22,6 +22,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.problem import log_density
 from imu_fusion.estimation.smoother.profile_fit import profile_error, widened_by_profile
+from imu_fusion.estimation.smoother.receiver_fit import clock_error, lever_errors
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.sensor_lag import field_lag
@@ -34,6 +35,10 @@ _LEFT = 0.5          # of how much fixes wander, that a step of them may leave
 _LARGE = 1.5         # standard deviations, of typical innovations of the receiver
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
+_LEVER = "gnss.lever_arm_sd"
+_SHIFTED = 3.0       # standard deviations of an error of antenna or clock, which is tried
+_LEVER_SD = 1.0      # m, or twice as far as the antenna is said to be: what a wrong sign makes
+_CLOCK_TRIES = 4     # a trajectory that is bent by a clock tells a part of what it is off by
 _LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
 _STEP_OF_DELAY = 0.1   # s, for which its likelihood is taken
 _PERHAPS = 1.0       # standard deviation of a delay that is tried: far from it they err
@@ -77,6 +82,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     if contradicted(found.result):
         return _adapted(found, model, given)
     if model.params.maximum_likelihood != "off":
+        found, model = _other_antenna(found, model, smooth)
+        found, model = _other_clock(found, model, smooth)
         found, model = _other_time(found, model, smooth)
         found, model = _bent_field(found, model, smooth)
     found, model = _repeated(found, model, smooth)
@@ -98,8 +105,8 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
                          _walks):
         for other in alternatives(found, model):
             found, model = _try(found, model, other, smooth)
-    # What wanders can have looked like a delay.
-    for name in (_DELAY, _VELOCITY_DELAY):
+    # What wanders can have looked like a delay, or another antenna.
+    for name in (_DELAY, _VELOCITY_DELAY, _LEVER):
         if model.params.get(name) != given[name]:
             found, model = _try(found, model, model.changed({name: given[name]}), smooth, -_GAIN)
     # Or like a step.
@@ -109,6 +116,43 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     if model.params.gnss.position_error_sd != tuple(given["gnss.position_error_sd"]):
         found, model = _no_surer_than_stated(found, model, given, smooth)
     return _adapted(found, model, given)
+
+
+def _other_antenna(found, model, smooth):
+    """With an antenna that is not where it is said to be, or fixes that are late, which is much the
+    same to a body that goes straight on."""
+    sd = max(_LEVER_SD, 2.0 * float(np.linalg.norm(model.params.gnss.lever_arm)))
+    for _ in range(2):
+        sds = max(abs(error.sds) for error in lever_errors(found.problem))
+        if sds < _SHIFTED * found.result.wander.get("fix", 1.0):
+            break
+        best = found, model
+        for other in (*_where_zero(model, {_LEVER: sd}), *_delays(found, model)):
+            tried = _smoothed(other, smooth)
+            if tried is not None and _gained(tried, found) > max(
+                    _GAIN, _gained(best[0], found)):
+                best = tried, other
+        if best[0] is found:
+            break
+        found, model = best
+    return found, model
+
+
+def _other_clock(found, model, smooth):
+    """With a receiver whose clock runs faster or slower, and may be off in the middle, too."""
+    for _ in range(_CLOCK_TRIES):
+        error, known = clock_error(found.problem), model.clock_rate != 0.0
+        if abs(error.sds) < (1.0 if known else
+                             _SHIFTED * found.result.wander.get("fix", 1.0)):
+            break
+        other = model._replace(clock_rate=model.clock_rate + error.size)
+        best = found, model
+        for tried in (other, *_delays(found, other)):
+            best = _try(*best, tried, smooth, 0.0 if known else _GAIN)
+        if best[0] is found:
+            break
+        found, model = best
+    return found, model
 
 
 def _late_fixes(found, model, smooth):
@@ -132,7 +176,7 @@ def _lateness(found):
 def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), stands=model.stands,
-                   profile=model.profile, late=dict(model.late),
+                   profile=model.profile, late=dict(model.late), clock_rate=model.clock_rate,
                    centre=other_centre(found.problem), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})

@@ -98,6 +98,11 @@ def _on_stamps(result):
                f"{'late' if lag > 0 else 'early'} against those of the Imu, as turns and forces "
                f"tell{leap}; they were taken so much {'earlier' if lag > 0 else 'later'}. Correct "
                "the recording, or see that both clocks are one")
+    if result.clock_rate:
+        yield (f"the clock of fixes and velocities runs by {1e6 * abs(result.clock_rate):.0f} "
+               f"millionths {'faster' if result.clock_rate > 0.0 else 'slower'} than that of the "
+               "Imu; their stamps were taken as much closer to the middle of the recording or "
+               "farther from it. Give both the stamps of one clock")
     for name, lag in result.late.items():
         what, other = _SENSORS[name], _SENSORS["gyr" if name == "mag" else "mag"]
         yield (f"{what} are {abs(lag) * 1e3:.0f} ms {'late' if lag > 0.0 else 'early'} against "
@@ -146,6 +151,12 @@ def _on_adapted(result):
         if "gnss.time_offset_sd" in adapted:
             delay, sd = (values[0, 0] for values in result.states["gnss_time_offset"])
             taken.append(f"fixes {delay:.2f} s late (standard deviation {sd:.2f} s)")
+        if "gnss.lever_arm_sd" in adapted:
+            lever, sds = (", ".join(f"{v:.2f}" for v in values[0])
+                          for values in result.states["gnss_lever_arm"])
+            taken.append(f"an antenna at [{lever}] m in the axes of the sensor (standard "
+                         f"deviations {sds} m), which is not gnss.lever_arm: see its sign, axes "
+                         "and unit")
         taken += [f"{factor:.2g} times the stated standard deviations of {name}"
                   for name, factor in result.noise.items()]
         yield ("with the noise as given the innovations are not white, or larger than stated; "

@@ -99,6 +99,8 @@ class SmootherResult:
     these heights hardly count. ``profile``: an error of the landing profile that the readings show,
     which counts less for it.
     ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
+    ``clock_rate``: by which the receiver's clock was found to run faster than that of the Imu, in
+    the middle of the recording right; its stamps were taken in time of the Imu.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
     ``centre``: (3,) m from the accelerometers, of a tumbling body whose surface.lever_arm is
@@ -131,6 +133,7 @@ class SmootherResult:
     stands: bool = True
     profile: ProfileError = ProfileError()
     late: dict[str, float] = field(default_factory=dict)
+    clock_rate: float = 0.0
     lost_turns: tuple[int, ...] = ()
     centre: np.ndarray | None = None
     rests: tuple[Rest, ...] = ()

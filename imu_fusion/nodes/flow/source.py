@@ -29,6 +29,7 @@ WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
 SETTLING = 1.0  # s without anybody new, after which all who are there are taken to be known
+MATCHING = 5.0  # s without anybody new, after which readers that are not ours keep nobody waiting
 
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
@@ -333,20 +334,21 @@ class Source:
             return False
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
-            if {j.topics[topic].reader for j in self._answers().values()
-                    if topic in j.topics and not j.finished} - set(map(gid, infos)):
+            ours = {j.topics[topic].reader for j in self._answers().values()
+                    if topic in j.topics and not j.finished}
+            if ours - set(map(gid, infos)) or output.matched() < len(ours):
                 return False
             compatible = sum(
                 i.topic_type == type_name(output.msg_type)
                 and qos_check_compatible(output.qos, i.qos_profile)[0] != QoSCompatibility.ERROR
                 for i in infos)
-            if output.matched() < compatible:
+            if output.matched() < compatible and self._is_settling(MATCHING):
                 return False
         return True
 
-    def _is_settling(self):
+    def _is_settling(self, within=SETTLING):
         """Whether somebody may be there who is not known yet."""
-        return time.monotonic() - self._news_at < SETTLING
+        return time.monotonic() - self._news_at < within
 
     def _look_around(self):
         """Find out who subscribes and is not, or not yet, known as one of ours."""

@@ -11,7 +11,7 @@ from imu_fusion.estimation.orientation.params import kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_MAG_SATURATED, FLAG_MAG_USED
 from imu_fusion.samples.logs import MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
-from test.estimation.orientation.test_estimator import make
+from test.estimation.orientation.test_estimator import errors_deg, make
 
 RANGE = 130e-6
 STEP = 0.3e-6      # a 12-bit or 16-bit sensor of 130 to 4900 uT
@@ -154,3 +154,44 @@ def test_one_or_three_elements_in_tesla():
             OrientationParams.from_mapping({"sensor.mag_range": wrong})
     three = OrientationParams.from_mapping({"sensor.mag_range": (1e-3, 2e-3, 3e-3)})
     assert three.sensor.mag_range == (1e-3, 2e-3, 3e-3)
+
+
+@pytest.fixture(scope="module")
+def tumbling():
+    imu, mag, truth, _ = simulate(Tumbling(seed=6), 24.0, rate=100.0, mag_rate=50.0, sensors=NOISY,
+                                  seed=5)
+    return imu, mag, truth.quat_world_imu
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+def test_a_stuck_magnetometer_is_no_hard_iron_and_is_said(tumbling, mode):
+    imu, mag, truth = tumbling
+    half = len(mag) // 2
+    values = mag.mag.copy()
+    values[half:] = values[half]
+    estimator = make({"mode": mode})
+    rows = estimator.run(imu, MagLog(mag.stamp, values))
+    assert errors_deg(rows, truth).max() < 5.0
+    # All but those before the turn that its noise does not hide.
+    assert half - 10 < estimator.summary()["mag_repeated"] < half
+    assert any("repeated one value for 12 s" in text for text in estimator.remarks())
+
+
+def test_what_a_driver_fills_in_is_as_if_it_had_not_come(tumbling):
+    imu, mag, truth = tumbling
+    filled = MagLog(mag.stamp, mag.mag[np.arange(len(mag)) // 5 * 5])
+    error = []
+    for each in (filled, mag[::5]):
+        estimator = make({"mode": "smoothed"})
+        error.append(errors_deg(estimator.run(imu, each), truth).mean())
+        assert not estimator.remarks()
+    assert error[0] < 1.2 * error[1]
+
+
+def test_a_coarse_magnetometer_at_rest_repeats_and_is_used():
+    imu, mag, _, _ = simulate(Tumbling(seed=6, rest=10.0), 10.0, rate=100.0, mag_rate=50.0,
+                              sensors=NOISY, seed=5)
+    estimator = make({})
+    estimator.run(imu, MagLog(mag.stamp, quantised(mag.mag, 2e-6)))
+    assert estimator.summary()["mag_repeated"] == 0
+    assert estimator.summary()["mag_used"] == len(mag) - 1   # not that before the first Imu

@@ -1,0 +1,87 @@
+"""Whether fixes and velocities show an antenna that is elsewhere, or a clock that runs otherwise.
+
+A smooth trajectory takes such errors along and leaves innovations that look white. How the cost
+changes with a shift of the readings is what is left of them, times the shift: exactly, as the
+trajectory is where the cost is least. How sure that is takes passes of the filter (a score test:
+Rao 1948), and is asked only where it may be more than chance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # its parts are loaded where they are first used
+
+from imu_fusion.estimation.smoother.measurements.registry import FIX, MOVED_FIX, VELOCITY
+from imu_fusion.estimation.smoother.problem import Problem
+from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, VEL, slow_states
+
+_LARGEST = 6.0     # standard deviations, to which what is left is cut: outliers tell nothing
+_PERHAPS = 1.0     # of them, all that is left taken together: less is not asked for
+_LEVER = 0.1       # m, for which its likelihood is taken
+_RATE = 1e-3       # likewise, of a clock
+_FEWEST = 20       # readings
+
+
+class Shift(NamedTuple):
+    """How large an error seems to be, and by how many standard deviations it is not zero."""
+
+    size: float = 0.0
+    sds: float = 0.0
+
+
+def lever_errors(problem: Problem) -> list[Shift]:
+    """Metres along x, y and z of the imu frame, by which the antenna is not where it is said to be.
+
+    Args:
+        problem: solved.
+    """
+    motion = _Motion(problem)
+    return _shifts(problem, [motion.of_lever(axis) for axis in np.eye(3)], _LEVER)
+
+
+def clock_error(problem: Problem) -> Shift:
+    """By how much (1: twice as fast) the clock of the receiver runs faster than that of the Imu."""
+    return _shifts(problem, [_Motion(problem).of_clock()], _RATE)[0]
+
+
+class _Motion:
+    """Of the body, at the readings (M,) of the receiver."""
+
+    def __init__(self, problem: Problem):
+        x, log = problem.x, problem.imu.log
+        sample = np.repeat(np.arange(len(x)), np.diff(problem.reading_start))
+        kind = problem.readings["kind"]
+        self.place = np.isin(kind, (FIX, MOVED_FIX))[:, None]
+        self.speed = (kind == VELOCITY)[:, None]
+        self.since = (log.stamp[sample] - log.stamp.mean()) * 1e-9
+        self.velocity = x[sample, VEL:VEL + 3]
+        time = (log.stamp - log.stamp[0]) * 1e-9
+        self.acceleration = np.gradient(x[:, VEL:VEL + 3], time, axis=0)[sample]
+        self.rate = (log.gyr - slow_states(x, GYR_BIAS, 3))[sample]
+        self.attitude = scipy.spatial.transform.Rotation.from_quat(x[sample, ATT:ATT + 4])
+
+    def of_lever(self, lever):
+        """What readings (M, 3) change by, if the antenna is a lever (3,) m away."""
+        return (self.place * self.attitude.apply(lever)
+                + self.speed * self.attitude.apply(np.cross(self.rate, lever)))
+
+    def of_clock(self):
+        """What they change by, if stamps are of a clock that runs twice as fast, and is right in
+        the middle of the recording."""
+        return -self.since[:, None] * (self.place * self.velocity
+                                       + self.speed * self.acceleration)
+
+
+def _shifts(problem, changes, size):
+    """Shifts of readings by each of changes (M, 3) of them; zeros where they may be chance."""
+    white = [np.einsum("mij,mj->mi", problem.readings["whiten"], change).ravel()
+             for change in changes]
+    left = np.clip(problem.fit["residual"], -_LARGEST, _LARGEST).ravel()
+    slopes = np.array([left @ each for each in white])
+    # Of readings that no trajectory follows: an upper bound of the curvature.
+    most = np.array([[one @ other for other in white] for one in white])
+    told = np.count_nonzero(white[0].reshape(-1, 3).any(axis=1)) >= _FEWEST
+    if not told or slopes @ np.linalg.lstsq(most, slopes)[0] < _PERHAPS ** 2:
+        return [Shift()] * len(changes)
+    # Readings have to be smaller by what an error makes them larger.
+    return [Shift(*problem.shift(size, readings=-change)) for change in changes]
