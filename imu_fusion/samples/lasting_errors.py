@@ -34,6 +34,7 @@ _SURELY = 3.0           # standard deviations that are taken off before an error
 _CLEARLY = 5.0          # and that it must have; by what is up alone _SURELY do
 _CONSTANT = 0.4         # m/s^2: more than accelerometers are off by, once calibrated
 _TURNS = 3.0            # rad on the way, that a body turns in a stretch
+_WILD = 20.0            # times what all but a hundredth of the samples are off their neighbours
 _CLIPPED = 0.999        # of a limit
 _LATE = 0.02            # s: less is a matter of filters
 _FEELS = 5e-3           # rad/s per m/s^2 (3 deg/s per g): fifteen times what gyroscopes feel
@@ -139,7 +140,7 @@ def _stretches(imu, vectors, length):
     size = len(stamp) // (count * group)
     used = count * size * group
     rates, forces, vectors = (
-        np.asarray(values[:used], dtype=float).reshape(count, size, group, 3).mean(axis=2)
+        _without_spikes(values[:used]).reshape(count, size, group, 3).mean(axis=2)
         for values in (gyr, imu.acc, vectors))
     steps = np.diff(stamp[:used].reshape(count, size * group), axis=1)
     # A gap shifts all that comes after it.
@@ -151,6 +152,15 @@ def _stretches(imu, vectors, length):
     best = best[path[best] * group * interval > _TURNS]
     return Stretches(group * interval, rates[best], forces[best], vectors[best]) if len(
         best) else None
+
+
+def _without_spikes(values):
+    """Values (n, 3), single ones that are wild replaced by a neighbour."""
+    values = np.asarray(values, dtype=float)
+    near = scipy.ndimage.median_filter(values, (3, 1), mode="nearest")
+    off = np.abs(values - near)
+    usual = np.nanpercentile(off, 99.0) if np.isfinite(off).any() else 0.0
+    return np.where(off > _WILD * usual, near, values)
 
 
 def _fit(parts, names, first, stays):

@@ -18,6 +18,7 @@ _BEYOND = 4.0       # of its standard deviation: a mounting that is not as descr
 _FAR = 4.5          # of it: a bias, which takes up errors of the motion, too
 _UNLIKELY = 0.01    # chance of mountings that, taken together, are further off: worth a remark
 _HARDLY = 1e-5      # and of biases
+_BLURS = 2.0        # of the share that positions are off by, of the turning that passes for it
 _WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
 _NOISIER = 1.25     # as much for the noise, if it lasts: data that fit never change it
 _SHARE = 0.1        # of the samples, in which noise may be larger, or the rate hardly known
@@ -147,7 +148,9 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, params: AccelerationF
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
             "motion.jerk_density and motion.acceleration_rate_density, or use maximum_likelihood")
-    return remarks + start_remarks(adaptation, params.initial)
+    felt = array.channels[~array.channels["is_gyro"]]
+    blurred = _BLURS * float(felt["position_sd"].max()) / max(array.radius, 1e-12)
+    return remarks + start_remarks(adaptation, params.initial, blurred)
 
 
 def _biases(fits, array, state):

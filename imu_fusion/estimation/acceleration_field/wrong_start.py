@@ -127,8 +127,9 @@ def doubt_of_start(state, doubt):
             doubt[OMEGA:ALPHA] = scale * about
 
 
-def start_remarks(adaptation: np.ndarray, initial: Initial) -> list[str]:
-    """What an ADAPTATION says of the start."""
+def start_remarks(adaptation: np.ndarray, initial: Initial, blurred: float) -> list[str]:
+    """What an ADAPTATION says of the start. blurred: share of a turn that errors of the mounting
+    may make up."""
     score, information, about = (adaptation[name] for name in ("score", "information", "about"))
     advice = ("add a gyroscope (use_gyro: true), or give initial.angular_velocity (initial.mode "
               "given)")
@@ -152,7 +153,8 @@ def start_remarks(adaptation: np.ndarray, initial: Initial) -> list[str]:
     size, axes = size[told], axes[:, told]
     off = axes @ (axes.T @ score / size)
     length, spread = float(np.linalg.norm(off)), np.sqrt(np.sum((axes.T @ off) ** 2 / size))
-    if length * length > max(_SLOW * length, _SURELY * spread):
+    slow = _SLOW + blurred * float(np.linalg.norm(initial.angular_velocity))
+    if length * length > max(slow * length, _SURELY * spread):
         text = ", ".join(f"{value:.1f}" for value in off)
         return [f"the motion says that the body turned by some ({text}) rad/s more than "
                 "initial.angular_velocity says: correct it, or raise initial.angular_velocity_sd"]
