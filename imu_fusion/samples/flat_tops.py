@@ -35,6 +35,7 @@ _ENTRY_SHARE = 2e-3
 _STEPS = 4.0
 _BAND_FLOOR = 1.5          # times the smallest range: a level that a band can prove
 _RUN = 4                   # samples of the shortest run that counts: fewer have no shape
+_INSIDE = 0.5              # of the step with which a run was reached: the largest inside it
 _STEEP = 12.0              # (n - 1) e / b of a run that counts: twice that of a smooth peak
 
 FLAT_TOPS = np.dtype([
@@ -132,7 +133,9 @@ def _look_at(found, i, sample, floor, rests_high):
     if lasting > found.level[i] * (1.0 + _SPREAD):
         found.level[i] = 0.0
     high, low = max(found.high[i], size), min(found.low[i], size)
-    if value * last > 0.0 and high - low <= BAND * high:
+    # What still approaches its top, or leaves it, is no part of it.
+    if (value * last > 0.0 and high - low <= BAND * high
+            and move <= max(_INSIDE * found.run_step[i], found.quantum[i])):
         found.high[i], found.low[i] = high, low
         found.count[i] += 1
         found.inner_step[i] = max(found.inner_step[i], move)

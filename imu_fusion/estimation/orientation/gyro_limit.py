@@ -12,6 +12,12 @@ from imu_fusion.samples.flat_tops import (
     start_flat_tops,
 )
 
+_QUIET = 0.3         # of the noise of a sample: what moves less is clipped
+_LASTING = 16        # bends between samples of a flat top that is the only one
+_WINDOW = 16         # samples, of which the quietest show the noise
+_MIXED = 0.1         # of another axis: no calibration mixes more
+_ROUNDS = 4
+_KEPT = 0.85         # of them: the others lead to the top and from it
 _ALIKE = 0.05        # of a limit: what calibrations let those of the axes of one sensor differ by
 
 
@@ -62,9 +68,42 @@ def limits_of(gyr: np.ndarray, par: np.ndarray) -> np.ndarray:
     found = np.zeros(1, FLAT_TOPS)
     _find_all(found, par, np.ascontiguousarray(gyr))
     limit, largest = found["limit"][0], found["largest"][0]
+    given = par["sensor"]["gyro_range"][0]
+    for i in range(3):
+        if np.isnan(given[i]) and np.isinf(limit[i]) and largest[i] > GYRO_FLOOR:
+            level = _quiet_top(gyr, i, largest[i])
+            if level:
+                limit[i], found["tolerance"][0, i] = level, 2.0 * BAND
     known = np.isfinite(limit)
-    if known.any() and np.isnan(par["sensor"]["gyro_range"]).any():
+    if known.any() and np.isnan(given).any():
         shared = limit[known].max()
         alike = ~known & (np.abs(largest / shared - 1.0) < _ALIKE)
         limit[alike], found["tolerance"][0, alike] = shared, _ALIKE
     return found
+
+
+def _quiet_top(gyr, i, largest):
+    """Level (rad/s) of a flat top of axis i that comes once in a recording, 0 where there is none:
+    near its largest value an axis has less than its noise, but for what a calibration mixes in of
+    the other axes. No motion does that."""
+    size = np.abs(gyr[:, i])
+    at_top = size >= (1.0 - BAND) * largest
+    away = size < (1.0 - _ALIKE) * largest
+    bends = np.diff(gyr, n=2, axis=0)    # which motion hardly has
+    new = np.diff(gyr, axis=0).any(axis=1)    # a driver that repeats whole samples is not quiet
+    new = new[1:] & new[:-1]
+    top, elsewhere = (new & m[2:] & m[1:-1] & m[:-2] for m in (at_top, away))
+    if np.count_nonzero(top) < _LASTING or np.count_nonzero(elsewhere) < _WINDOW:
+        return 0.0
+    windows = np.abs(bends[elsewhere, i])
+    noise = windows[:len(windows) // _WINDOW * _WINDOW].reshape(-1, _WINDOW).mean(axis=1).min()
+    own, others = bends[top, i], np.delete(bends[top], i, axis=1)
+    left = np.abs(own)
+    for _ in range(_ROUNDS):    # the way to the top and from it is among them
+        kept = left <= max(3.0 * float(np.median(left)), noise)
+        shares = np.linalg.lstsq(others[kept], own[kept], rcond=None)[0]
+        if np.abs(shares).max() > _MIXED:    # another axis that is clipped, too, shows this one
+            break
+        left = np.abs(own - others @ shares)
+    quiet = kept.mean() > _KEPT and left[kept].mean() < _QUIET * noise
+    return float(np.median(size[at_top])) if quiet else 0.0

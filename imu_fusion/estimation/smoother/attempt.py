@@ -357,3 +357,11 @@ def other_centre(problem: Problem) -> np.ndarray | None:
         return None
     off = np.abs(found.point - surface.lever_arm)
     return found.point if np.any(off > _OFF_CENTRE * np.hypot(found.sd, _CENTRE_SD)) else None
+
+
+def clipped_forces(problem: Problem) -> tuple[int, float]:
+    """Number of samples whose force was at the end of a range that nobody gave, and that range."""
+    imu = problem.imu
+    if problem.params.sensor.acc_range is not None:
+        return 0, np.inf
+    return int(imu.clipped[:, 3:].any(axis=1).sum()), float(imu.acc_range.min())

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from imu_fusion.errors import EstimationError
-from imu_fusion.estimation.smoother.attempt import Attempt, Model, other_centre
+from imu_fusion.estimation.smoother.attempt import Attempt, Model, clipped_forces, other_centre
 from imu_fusion.estimation.smoother.gnss_step import find_steps
 from imu_fusion.estimation.smoother.measurements.registry import (
     FIX,
@@ -177,7 +177,8 @@ def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), stands=model.stands,
                    profile=model.profile, late=dict(model.late), clock_rate=model.clock_rate,
-                   centre=other_centre(found.problem), adapted={
+                   centre=other_centre(found.problem),
+                   clipped_forces=clipped_forces(found.problem), adapted={
         name: value for name, value in model.params.to_mapping().items()
         if value != given[name]})
 

@@ -9,8 +9,10 @@ import numpy as np
 from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.smoother.params import SmootherParams
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.samples.flat_tops import ACC_FLOOR
 from imu_fusion.samples.logs import FixLog, ImuLog
 from imu_fusion.samples.motion_span import last_rest
+from imu_fusion.samples.repeated_extremes import range_shown
 from imu_fusion.surfaces.constraint import Surface
 
 _FAR = 50e3   # m from the origin of a surface, where its plane of axes no longer describes it
@@ -77,12 +79,14 @@ def from_start(imu: ImuLog, params: SmootherParams) -> ImuLog:
 @dataclass(frozen=True)
 class ImuInput:
     """Samples with gaps bridged: ``recorded`` (N,) tells the bridges, ``clipped`` (N, 6) the rates
-    and forces out of range. ``noise`` (N - 1, 6): variance densities of the intervals."""
+    and forces out of range. ``noise`` (N - 1, 6): variance densities of the intervals.
+    ``acc_range`` (3,) m/s^2, infinite where none was given and nothing shows one."""
 
     log: ImuLog
     recorded: np.ndarray
     clipped: np.ndarray
     noise: np.ndarray
+    acc_range: np.ndarray
 
     @property
     def steps(self) -> np.ndarray:
@@ -113,22 +117,41 @@ def prepare_imu(imu: ImuLog, params: SmootherParams) -> ImuInput:
     imu = imu[good]
     if len(imu) < _LEAST:
         raise SampleError(f"{len(imu)} usable Imu samples: the smoother needs at least {_LEAST}")
-    imu, recorded = _bridged(imu, params.gap.max)
     sensor, gap = params.sensor, params.gap
+    acc_range = (range_shown(imu.acc, ACC_FLOOR) if sensor.acc_range is None
+                 else np.broadcast_to(sensor.acc_range, 3))
+    imu, recorded = _bridged(imu, params.gap.max)
     noise, clipped = [], []
     for values, limit, density, unknown in (
             (imu.gyr, sensor.gyro_range, sensor.gyro_noise_density, gap.gyro_noise_density),
-            (imu.acc, sensor.acc_range, sensor.acc_noise_density, gap.acc_noise_density)):
+            (imu.acc, acc_range, sensor.acc_noise_density, gap.acc_noise_density)):
         lost = np.repeat(~recorded[:, None], 3, axis=1)
         if limit is not None:
             lost |= np.abs(values) >= _FULL_SCALE * np.array(limit)
         clipped.append(lost & recorded[:, None])
         either = lost[1:] | lost[:-1]
         noise.append(np.where(either, unknown, density) ** 2)
+    risen = _still_rising(imu.acc, clipped[1])
+    steps = np.diff(imu.stamp)[:, None] * 1e-9
+    noise[1] = np.maximum(noise[1], np.maximum(risen[1:], risen[:-1]) ** 2 * steps)
     if imu.gyr_sd is not None:
         sd = np.maximum(imu.gyr_sd[1:], imu.gyr_sd[:-1])
         noise[0] = np.maximum(noise[0], sd ** 2 * np.diff(imu.stamp)[:, None] * 1e-9)
-    return ImuInput(imu, recorded, np.concatenate(clipped, axis=1), np.concatenate(noise, axis=1))
+    return ImuInput(imu, recorded, np.concatenate(clipped, axis=1), np.concatenate(noise, axis=1),
+                    acc_range)
+
+
+def _still_rising(acc: np.ndarray, clipped: np.ndarray) -> np.ndarray:
+    """(n, 3) m/s^2: by how much forces may have been beyond the range in samples that were clipped,
+    had they gone on to rise until the middle of them as they came; 0 elsewhere."""
+    risen = np.zeros_like(acc)
+    for i in range(3):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], clipped[:, i], [False]])))
+        for first, end in edges.reshape(-1, 2):
+            beside = acc[[max(first - 1, 0), min(end, len(acc) - 1)], i]
+            step = np.abs(acc[first, i] - beside).max()
+            risen[first:end, i] = 0.5 * (end - first + 1) * step
+    return risen
 
 
 def _bridged(imu: ImuLog, longest: float) -> tuple[ImuLog, np.ndarray]:

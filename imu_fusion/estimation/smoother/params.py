@@ -42,7 +42,8 @@ class Sensor(Parameters):
         "acc_bias_walk", 0.0, "0: it stands still; raise it for recordings of many minutes.")
     acc_matrix_sd: float = sensor("acc_matrix_sd", 0.0)
     acc_range: tuple[float, ...] | None = sensor(
-        "acc_range", None, "Forces beyond it are recovered from the smoothed motion.")
+        "acc_range", None, "Found where the largest readings repeat exactly. Forces beyond it are "
+        "recovered from the smoothed motion.")
     mag_noise_sd: float = sensor(
         "mag_noise_sd", 5e-6, "Raise it beside motors: an error that n samples in a row repeat "
         "counts as sqrt(n) times as large.")

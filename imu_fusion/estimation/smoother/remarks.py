@@ -43,6 +43,7 @@ def remarks_on(result: "SmootherResult") -> Iterator[str]:
                "(initial.start chooses another start)")
     yield from _on_missing_imu(result)
     yield from _on_lost_turns(result)
+    yield from _on_clipped_forces(result)
     yield from _on_centre(result)
     yield from _on_stamps(result)
     yield from _on_repeats(result)
@@ -74,6 +75,14 @@ def _on_lost_turns(result):
                "follows about as well the likeliest is taken, and attitude and trajectory from "
                "there on may be wrong by more than is stated; more fixes, or a surface known "
                "better, tell")
+
+
+def _on_clipped_forces(result):
+    count, limit = result.clipped_forces
+    if count:
+        yield (f"the accelerometer was at the end of its range in {count} samples, as readings of "
+               f"{limit:.4g} m/s^2 that repeat tell: what was felt beyond is not known, and counts "
+               "as gap.acc_noise_density says (sensor.acc_range gives the range)")
 
 
 def _on_centre(result):

@@ -105,6 +105,8 @@ class SmootherResult:
     likely: the turn about the field had been lost.
     ``centre``: (3,) m from the accelerometers, of a tumbling body whose surface.lever_arm is
     another; None: it is not.
+    ``clipped_forces``: number of Imu samples whose force was at the end of a range that was found,
+    and that range (m/s^2).
     ``left_out``: number of Imu samples before the start; ``start_found``: whether that was found.
     ``rests``: at which the velocity was taken for zero.
     ``failure``: why nothing could be read off a jump; empty in what the smoother returns.
@@ -136,6 +138,7 @@ class SmootherResult:
     clock_rate: float = 0.0
     lost_turns: tuple[int, ...] = ()
     centre: np.ndarray | None = None
+    clipped_forces: tuple[int, float] = (0, np.inf)
     rests: tuple[Rest, ...] = ()
     left_out: int = 0
     start_found: bool = False

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
+from imu_fusion.estimation.orientation.gyro_limit import limits_of
+from imu_fusion.estimation.orientation.params import kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_SATURATED
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.sensors.saturation import saturated_axes
@@ -76,3 +78,36 @@ def test_one_wild_rate_does_not_hide_the_limit_and_both_ends_of_a_range_count():
     # What comes before the fourth sample of the first flat top of each axis is not known.
     assert flagged[at_limit.any(axis=1)][100:].all()
     assert not flagged[~at_limit.any(axis=1)].any()
+
+
+def mixed_and_noisy(rates, rng):
+    """Rates (n, 3) as a gyroscope clips them at RANGE and a calibration mixes them afterwards."""
+    calibration = np.eye(3) + 0.003 * rng.standard_normal((3, 3))
+    return np.clip(rates + 0.005 * rng.standard_normal(rates.shape), -6.0, 6.0) @ calibration.T
+
+
+def limits(gyr):
+    return limits_of(gyr, kernel_parameters(OrientationParams()))["limit"][0]
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_top_that_is_reached_slowly_is_found(times):
+    """At 200 Hz, by steps as small as those that misalignment leaves of it, and perhaps once."""
+    time, rng = np.arange(2000 * times) / 200.0, np.random.default_rng(1)
+    bumps = sum(np.exp(-0.5 * ((time - 5.0 - 10.0 * k) / 0.7) ** 2) for k in range(times))
+    rates = np.column_stack([8.0 * bumps, 3.0 * np.sin(2.0 * time), 2.0 * np.sin(3.3 * time)])
+    found = limits(mixed_and_noisy(rates, rng))
+    assert found[0] == pytest.approx(6.0, rel=0.02)
+    assert np.isinf(found[1:]).all()
+    # The same rates within the range: a peak, with the noise of one.
+    assert np.isinf(limits(mixed_and_noisy(0.7 * rates, rng))).all()
+
+
+def test_a_turn_at_a_constant_rate_is_no_top():
+    """Its noise goes on; neither do equal values of a coarse converter count."""
+    time, rng = np.arange(2000) / 200.0, np.random.default_rng(1)
+    yaw = 4.0 * np.clip(np.minimum(time - 2.0, 8.0 - time) / 0.3, 0.0, 1.0)
+    rates = np.column_stack([np.sin(2.0 * time), 0.5 * np.sin(3.3 * time), yaw])
+    noisy = rates + 0.005 * rng.standard_normal(rates.shape)
+    assert np.isinf(limits(noisy)).all()
+    assert np.isinf(limits(0.01 * np.round(noisy / 0.01))).all()

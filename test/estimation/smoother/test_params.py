@@ -24,7 +24,7 @@ CHANGED = {
     "sensor.acc_bias_sd": (0.1, {}),
     "sensor.acc_bias_walk": (1e-3, {}),
     "sensor.acc_matrix_sd": (0.02, {}),
-    "sensor.acc_range": ((30.0,), {}),
+    "sensor.acc_range": ((25.0,), {}),     # 30 is found
     "sensor.mag_noise_sd": (1e-5, {}),
     "sensor.mag_bias_sd": (1e-6, {}),
     "sensor.mag_scale_sd": (0.01, {}),

@@ -44,11 +44,15 @@ def test_sensor_errors_are_found(recording, result):
 
 
 def test_corrected_readings_err_as_they_say(jump):
-    """Clipped ones too: rates beyond 2 rad/s (some 30 samples per axis), and the impact."""
+    """Clipped ones too: rates beyond 2 rad/s (some 30 samples per axis), and the impact, whose
+    range nobody gave."""
     r = record(jump, np.random.default_rng(8), PhoneErrors(gyr_range=2.0))
     imu = dataclasses.replace(r.imu, acc=np.clip(r.imu.acc, -40.0, 40.0))
-    params = SmootherParams(sensor=Sensor(gyro_range=(2.0,), acc_range=(40.0,)))
-    s = Smoother(params, jump.hill).run(imu, r.mag, r.fix, r.velocity).samples
+    found = Smoother(SmootherParams(sensor=Sensor(gyro_range=(2.0,))), jump.hill).run(
+        imu, r.mag, r.fix, r.velocity)
+    s = found.samples
+    assert found.clipped_forces == (np.any(np.abs(imu.acc) >= 40.0, axis=1).sum(), 40.0)
+    assert any("sensor.acc_range" in remark for remark in found.remarks())
     true = period_means(jump, (imu.stamp - EPOCH) * 1e-9, 0.01)
     for name, raw, truth, limit, noise in (("gyr", imu.gyr, true[0], 2.0, 0.0175),
                                            ("acc", imu.acc, true[1], 40.0, 0.1)):
