@@ -52,7 +52,7 @@ def test_nothing_is_said_of_velocities_that_lead_from_fix_to_fix(seed, sd):
 @pytest.mark.parametrize(("change", "text"), [
     (lambda v: v[:, [1, 0, 2]] * [1.0, 1.0, -1.0], "north, east, down"),
     (lambda v: 3.6 * v, "in km/h"),
-    (lambda v: v / 0.514444, "in knots"), (lambda v: v / 0.3048, "in ft/s"),
+    (lambda v: v / 0.514444, "in knots"), (lambda v: 100.0 * v, "in cm/s"),
     (lambda v: -v, "reversed"),
     (lambda v: 0.0 * v, "all velocities are zero"),
     (lambda v: np.linalg.norm(v, axis=1)[:, None] * [1.0, 0.0, 0.0], "the body")])

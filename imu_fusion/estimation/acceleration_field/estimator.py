@@ -20,7 +20,13 @@ from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.acceleration_field.affine import AffineFilter
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.maximum_likelihood import fit_densities
-from imu_fusion.estimation.acceleration_field.motion_model import BIAS, State, parts
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ALPHA,
+    BIAS,
+    OMEGA,
+    State,
+    parts,
+)
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
     AccelerometerParams,
@@ -38,6 +44,7 @@ from imu_fusion.estimation.acceleration_field.sensor_faults import (
 )
 from imu_fusion.estimation.acceleration_field.standing_axes import StandingAxes
 from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
+from imu_fusion.estimation.acceleration_field.wrong_start import turn_to_reckon_with
 
 
 class AccelerationFieldEstimator:
@@ -278,8 +285,10 @@ class AccelerationFieldEstimator:
     def _still_rows(self, stamp, start):
         x = parts(start.x)
         rows = np.empty(len(stamp), ROW)
+        doubt = np.zeros(BIAS)
+        doubt[OMEGA:ALPHA] = turn_to_reckon_with(start.about)
         put_still_rows(kernel_params(self.params, self.array), stamp, start.quat, x.omega, x.alpha,
-                       x.acc, np.ascontiguousarray(start.cov[:BIAS, :BIAS]), rows)
+                       x.acc, np.ascontiguousarray(start.cov[:BIAS, :BIAS]), doubt, rows)
         return rows
 
     def _begin(self):

@@ -262,9 +262,24 @@ class Problem:
             self.fit.copy(), make_storage(0, 0, n), make_scratch(n))
         return log_density(readings) - surprise
 
+    def carried(self, last: int, first: int = 0,
+                begin: tuple[np.ndarray, np.ndarray] | None = None
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Deviation (n,) and covariance (n, n) before the rows of sample ``last``, from those
+        before the rows of ``first``; None: the prior."""
+        n = self.size
+        if begin is None:
+            delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
+            boxminus(self.mean, self.x[0], delta)
+        else:
+            delta, cov = begin[0].copy(), begin[1].copy()
+        filter_segment(first, last, False, self.x, delta, cov, self.recording, self.fit.copy(),
+                       make_storage(0, 0, n), make_scratch(n))
+        return delta, cov
+
     def shift(self, size: float, readings: np.ndarray | None = None,
-              contacts: np.ndarray | None = None, first: int = 0, last: int | None = None
-              ) -> tuple[float, float]:
+              contacts: np.ndarray | None = None, first: int = 0, last: int | None = None,
+              begin: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[float, float]:
         """How large, in units of ``size``, a shift of rows seems to be, and by how many standard
         deviations that is not zero: the likelihood, linear about the trajectory, is a parabola in
         it (score test: Rao 1948).
@@ -273,12 +288,11 @@ class Problem:
             size: for which the likelihood is taken.
             readings: (M, 3) of values, for a shift of one. contacts: (r,) m, likewise.
             first: sample before which there is no shift. last: sample before which rows count.
+            begin: what :meth:`carried` has before the rows of ``first``.
         """
         n = self.size
-        delta, cov = np.zeros(n), np.diag(self.prior_sd ** 2)
-        boxminus(self.mean, self.x[0], delta)
+        delta, cov = self.carried(first) if begin is None else begin
         fit, storage, scratch = self.fit.copy(), make_storage(0, 0, n), make_scratch(n)
-        filter_segment(0, first, False, self.x, delta, cov, self.recording, fit, storage, scratch)
         found = []
         for factor in (-size, 0.0, size):
             shifted = self.recording

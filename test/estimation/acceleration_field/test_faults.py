@@ -335,6 +335,14 @@ def test_a_bias_far_beyond_its_sd_is_named(impact):
                for text in judged(impact, readings)[1])
 
 
+@pytest.mark.parametrize("seed", [8, 17])    # of twenty, those whose biases get the least far
+def test_biases_that_drift_are_named(impact, seed):
+    t = np.linspace(0.0, 1.0, len(impact.stamp))[:, None, None]
+    end = np.random.default_rng(seed).choice([-1.0, 1.0], (1, 4, 3))
+    remarks = judged(impact, felt(impact) + 0.8 * t * end)[1]
+    assert any("biases" in text and "bias_walk" in text for text in remarks), remarks
+
+
 @pytest.mark.parametrize("scale, turn, said", [(1.0, 0.0, None), (1.1, 0.0, "gyro_scale_sd"),
                                                (1.0, 20.0, "gyro_axes_sd")])
 def test_a_gyroscope_whose_scale_or_axes_are_off_is_named(impact, scale, turn, said):
@@ -403,8 +411,14 @@ def test_rest_and_a_steady_turn_about_the_vertical_are_told_apart_by_a_later_mot
     readings = np.einsum("kij,nkj->nki", turned, field)
     readings += random.normal(0, 0.1, (1, 4, 3)) + random.normal(0, NOISE, readings.shape)
     estimator = AccelerationFieldEstimator(AccelerationFieldParams(gravity=9.8), layout())
-    estimator.run(np.round(t * 1e9).astype(np.int64), readings)
+    rows = estimator.run(np.round(t * 1e9).astype(np.int64), readings)
     remarks = estimator.remarks()
+    # What is said widens what is stated; once motion has told of rest, nothing does.
+    off = np.abs(rate - rows["omega"])[:700]
+    sd = np.sqrt(np.einsum("nii->ni", rows["cov_omega"]))
+    assert np.all(off <= 3.0 * sd[:700])
+    assert sd[600, 2] > 1.0 and sd[600, :2].max() < 0.2
+    assert not (tumbles and speed == 0.0) or sd[-1].max() < 0.2
     if said is None:
         assert remarks == []
     else:

@@ -83,6 +83,8 @@ def test_an_error_of_the_profile_that_may_be_chance_widens_what_is_stated(result
     wider = widened_by_profile(result, ProfileError(-0.3, -2.5))
     up, before = (r.samples["cov_position"][:, 2, 2] for r in (wider, result))
     np.testing.assert_allclose(up - before, 0.09)
+    up, before = (r.samples["cov_velocity"][:, 2, 2] for r in (wider, result))
+    np.testing.assert_allclose(np.sqrt(up - before), 0.3 / result.jump.flight_time)
     assert wider.jump.length_sd == pytest.approx(np.hypot(result.jump.length_sd, 0.3))
     assert wider.jump.length == result.jump.length and wider.remarks() == []
 
@@ -99,7 +101,7 @@ def test_a_surface_is_placed_no_better_than_it_says_and_fixes_show():
     far = (np.inf,) * 3
     np.testing.assert_allclose(sd((0.0, 0.0, 0.0), far), [0.0, 0.0, 0.3])
     np.testing.assert_allclose(sd((0.0, 0.0, 0.0), (0.01, 0.01, 0.01)), [0.0, 0.0, 0.01], atol=1e-4)
-    np.testing.assert_allclose(sd((1.0, -2.0, 0.5), (0.9, 0.9, 0.4)), [0.0, 2.0, 0.24], atol=1e-3)
+    np.testing.assert_allclose(sd((0.8, -2.0, 0.3), (0.9, 0.9, 0.4)), [0.0, 2.0, 0.24], atol=1e-3)
     # Single fixes far away are no offset; errors that wander are known less well.
     residuals = np.random.default_rng(2).standard_normal((400, 3)) + [0.5, 0.0, 0.0]
     residuals[::20] += 100.0
