@@ -14,6 +14,8 @@ import numpy as np
 import pyproj
 from scipy.spatial.transform import Rotation
 
+from benchmarks.avalanche_bound import FIX_SD, least_error
+from benchmarks.avalanche_calibrations import calibration_errors
 from benchmarks.table import write_table
 from imu_fusion.estimation.avalanche.dead_reckoning import BallSamples, central_force, dead_reckon
 from imu_fusion.estimation.avalanche.in_situ import Constraint, calibrate_in_situ
@@ -27,11 +29,9 @@ from imu_fusion.evaluation.consistency import nees
 from imu_fusion.parameters.file import parameters_for
 from imu_fusion.samples.logs import FixLog
 from imu_fusion.samples.motion_span import find_motion
-from imu_fusion.sensors.accelerometer_calibration import calibrate_accelerometer
-from imu_fusion.sensors.gyroscope_calibration import Turn, calibrate_gyroscope
 from imu_fusion.sensors.magnetometer_calibration import calibrate_magnetometer
 from imu_fusion.simulation.avalanche import Avalanche, AvalancheParams
-from imu_fusion.simulation.ball_sensors import AVANODE, LEVER_ARM, RATE, BallErrors, record_ball
+from imu_fusion.simulation.ball_sensors import AVANODE, LEVER_ARM, BallErrors, record_ball
 from imu_fusion.streams.orientation_messages import OrientationOutputParams
 from imu_fusion.streams.smoother import recovery_params
 from imu_fusion.streams.smoother_params import SmootherNodeParams, SmoothingParams
@@ -41,7 +41,6 @@ from imu_fusion.surfaces.file import load_surface
 PRESET = Path(__file__).parent.parent / "config" / "avalanche.yaml"
 SEEDS, WHOLE_SEEDS = 50, 12
 END = 8.99            # s, where the paper ends, before the gap
-FIX_SD = 0.2          # m, of fixes averaged over minutes
 TERRAIN_SD = 5.0      # m, of a start that is a point of the terrain
 FEW = 12              # seeds of the rows that have their own recordings
 FRESH = BallErrors(acc_matrix_sd=0.002, acc_bias_sd=0.02)
@@ -57,8 +56,6 @@ GRID_CRS, GRID_STEP = "EPSG:32632", 2.0
 HUMP = 6.0            # m
 OUTAGES = ((0.3, 2.5), (4.0, 12.0), (30.0, 40.0))    # s since the entrainment, of a receiver
 WITHIN = 0.05         # s, of a transition
-REST = 2.0            # s, of a pose on the table
-STEP = 0.02           # s, of the bound of the position
 
 
 class Ball:
@@ -240,44 +237,6 @@ def phases(ball, rows):
     return np.array([found.get(p.number, np.nan) - p.start for p in ball.motion.phases[1:]])
 
 
-def calibration_errors(ball):
-    """Normalised errors of the magnetometer's offset (3,), and of what rests and turns by hand tell
-    of an accelerometer and a gyroscope with the ball's errors (12,), (12,)."""
-    sd = np.sqrt(ball.calibration.cov.diagonal()[:3])
-    errors, rng = BallErrors(), ball.rng
-    draw = lambda size: np.eye(3) + size * rng.standard_normal((3, 3))   # noqa: E731
-    (acc, acc_bias), (gyr, gyr_bias) = (
-        (draw(m), b * rng.standard_normal(3)) for m, b in (
-            (errors.acc_matrix_sd, errors.acc_bias_sd), (errors.gyr_matrix_sd, errors.gyr_bias_sd)))
-    mean = errors.acc_sd / np.sqrt(REST * RATE)
-    felt = ball.avalanche.gravity * np.vstack([np.eye(3), -np.eye(3)])
-    poses = felt @ acc.T + acc_bias + mean * rng.standard_normal(felt.shape)
-    offset_sd = np.full(3, errors.gyr_sd / np.sqrt(10 * REST * RATE))
-    offset = gyr_bias + offset_sd * rng.standard_normal(3)
-    turns = [half_turn(axis, gyr, gyr_bias, mean, rng) for axis in rng.standard_normal((12, 3))]
-    return [(ball.calibration.offset - ball.log.mag_offset) / sd,
-            linear_error(calibrate_accelerometer(poses, ball.avalanche.gravity, mean), acc,
-                         acc_bias),
-            linear_error(calibrate_gyroscope(turns, offset, offset_sd, np.pi), gyr, gyr_bias)]
-
-
-def linear_error(found, matrix, bias):
-    """Normalised errors (12,) of a LinearCalibration of a sensor that reads matrix @ x + bias."""
-    back = np.linalg.inv(matrix)
-    return np.concatenate([(found.matrix - back).ravel(), found.bias + back @ bias]) / found.sd
-
-
-def half_turn(axis, matrix, bias, mean, rng):
-    """Turn by 180 deg about an axis (3,) in two seconds, from a random pose."""
-    errors, axis = BallErrors(), axis / np.linalg.norm(axis)
-    time = np.arange(int(2 * RATE) + 1) / RATE
-    rate = 0.5 * np.pi * (1.0 - np.cos(np.pi * time))[:, None] * axis
-    seen = rate @ matrix.T + bias + errors.gyr_sd * rng.standard_normal(rate.shape)
-    before = Rotation.random(random_state=rng.integers(2 ** 31)).apply([0.0, 0.0, 9.8])
-    after = Rotation.from_rotvec(-np.pi * axis).apply(before)
-    return Turn(time, seen, *(v + mean * rng.standard_normal(3) for v in (before, after)))
-
-
 def at_rest(ball, errors):
     """Mean squares (rad^2) of the error of the most likely attitude that force and field at rest
     show, and of its standard deviation: no estimator without terrain or fixes knows more, since
@@ -293,33 +252,6 @@ def at_rest(ball, errors):
     found, _ = Rotation.align_vectors(world, seen, weights=sd ** -2)
     information = sum((np.eye(3) - np.outer(v, v)) / s ** 2 for v, s in zip(world, sd))
     return [(found.inv() * turn).magnitude() ** 2, np.trace(np.linalg.inv(information))]
-
-
-def least_error(gap):
-    """RMS, m, along one axis from -3 to 73 s, of the best estimate of a ball whose attitude and
-    sensors' constants are known at every instant, between two rests at known places: nothing errs
-    but the noise of the accelerometer's samples, and the fixes. Two integrations on a grid of STEP.
-
-    gap: (begin, end) s without samples; the acceleration there is that of the flow's jerks, whose
-    size is known, too.
-    """
-    time = np.arange(-3.0, 73.0, STEP)
-    inside = (time >= gap[0]) & (time < gap[1])
-    unfelt = 5.0 * AvalancheParams().jerk ** 2    # five jerks per second
-    q = np.where(inside, unfelt, BallErrors().acc_sd ** 2 / RATE)
-    step = np.array([[1.0, STEP], [0.0, 1.0]])
-    noise = np.array([[STEP ** 3 / 3, STEP ** 2 / 2], [STEP ** 2 / 2, STEP]])
-    known = np.diag([FIX_SD ** 2, 0.0])           # at either end it rests
-    forward = [known]
-    for k in range(len(time) - 1):
-        forward.append(step @ forward[-1] @ step.T + q[k] * noise)
-    cov, places = np.linalg.inv(np.linalg.inv(forward[-1]) + np.diag([FIX_SD ** -2, 1e6])), []
-    for k in range(len(time) - 2, -1, -1):
-        places.append(cov[0, 0])
-        ahead = step @ forward[k] @ step.T + q[k] * noise
-        gain = forward[k] @ step.T @ np.linalg.inv(ahead)
-        cov = forward[k] + gain @ (cov - ahead) @ gain.T
-    return float(np.sqrt(np.mean(places)))
 
 
 def without_errors(seed):

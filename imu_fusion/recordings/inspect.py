@@ -17,6 +17,7 @@ from imu_fusion.recordings.logs import LogCollector, undecodable
 from imu_fusion.samples import FixLog, ImuLog, MagLog, PoseLog, VelocityLog, checks
 from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.lasting_errors import check_field_errors
 from imu_fusion.samples.logs import Log
 from imu_fusion.samples.travel import check_travel
 
@@ -218,7 +219,8 @@ def _beside(report, imus, fixes):
     if len(imus) == 1:
         found += checks.check_clock(report.log.stamp, imus[0].stamp, report.topic)
         if isinstance(report.log, MagLog):
-            found += check_axes(imus[0], report.log, report.topic)
+            found += (check_axes(imus[0], report.log, report.topic)
+                      or check_field_errors(imus[0], report.log, report.topic))
     if len(fixes) == 1 and isinstance(report.log, VelocityLog):
         found += check_travel(fixes[0], report.log, report.topic)
     return replace(report, findings=(*report.findings, *found))

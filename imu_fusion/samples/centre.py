@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_fusion.samples.free_fall import force_at
 
@@ -12,6 +13,15 @@ _FEWEST = 400      # of these
 _PARTS = 10        # whose scatter tells the standard deviation
 _USUAL = 10.0      # m/s^2, beyond which a force counts less: blows
 _ROUNDS = 3
+_FLIGHT = 0.25       # s of a flight
+_SHORTEST = 12       # samples of it
+_FLIGHTS = 2         # that overlap by half of it
+_FLIES = 8.0         # rad/s, at which a sensor off the centre does not show it
+_FELT = 2.5          # m/s^2: what is felt less is free fall
+_EXPLAINED = 0.4     # of what is felt at the given point, that another one may leave
+_NOTHING = 1.5       # m/s^2, RMS of what is felt at the centre: noise, and 3 % of a calibration
+_TOLD = 1e-2         # of the largest eigenvalue: what tells less is left as it was given
+_INSIDE = 0.15       # m
 _ONE_AXIS = 1e10   # condition, beyond which the body turns about one axis alone
 
 
@@ -51,6 +61,50 @@ def find_centre(time: np.ndarray, force: np.ndarray, rate: np.ndarray) -> Centre
     scatter = sum(np.outer(e, e) for e in (r - n @ point for n, r in sums))
     cov = inverse @ scatter @ inverse * _PARTS / (_PARTS - 3.0)
     return Centre(point, np.sqrt(cov.diagonal()))
+
+
+def centre_in_flight(time: np.ndarray, force: np.ndarray, rate: np.ndarray,
+                     given: ArrayLike) -> np.ndarray | None:
+    """The point (3,) m that a body turns about while it flies, where nothing is felt, if it is not
+    the one that is given: a quarter of a second tells. Along the axis of the turn it is the given.
+
+    Args: as :func:`find_centre`; given: (3,) m.
+    """
+    given = np.asarray(given, dtype=float)
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    length = round(_FLIGHT / step) if step > 0.0 else 0
+    if length < _SHORTEST:
+        return None
+    nothing = np.zeros_like(force)
+    arms = np.stack([force_at(axis, time, nothing, rate) for axis in np.eye(3)], axis=2)
+    there = force + arms @ given
+    flights = []
+    for first in range(0, len(time) - length + 1, length // 2):
+        part = slice(first, first + length)
+        if (time[part][-1] - time[first] < 1.5 * _FLIGHT
+                and np.median(np.linalg.norm(rate[part], axis=1)) > _FLIES
+                and np.median(np.linalg.norm(there[part], axis=1)) > _FELT
+                and _explains(_nearest(arms[part], there[part]), given, arms[part], there[part])):
+            flights.append(part)
+    if len(flights) < _FLIGHTS:
+        return None
+    flown = np.unique(np.concatenate([np.arange(len(time))[part] for part in flights]))
+    off = _nearest(arms[flown], there[flown])
+    return given + off if _explains(off, given, arms[flown], there[flown]) else None
+
+
+def _explains(off, given, arms, force):
+    """Whether hardly anything is felt at a point of the body that is ``off`` the given."""
+    left, before = (np.sqrt(np.mean(np.sum(v ** 2, axis=1))) for v in (force + arms @ off, force))
+    return left < min(_NOTHING, _EXPLAINED * before) and np.linalg.norm(given + off) < _INSIDE
+
+
+def _nearest(arms, force):
+    """The smallest correction (3,) m after which nothing is felt, as far as the turn tells one."""
+    values, axes = np.linalg.eigh(np.einsum("nij,nik->jk", arms, arms))
+    told = axes[:, values > _TOLD * values[-1]]
+    right = told.T @ np.einsum("nij,ni->j", arms, force)
+    return -told @ (right / values[values > _TOLD * values[-1]])
 
 
 def _normal(arms, force, weight):

@@ -16,6 +16,7 @@ from imu_fusion.errors import shown
 from imu_fusion.samples.disagreement import check_agreement
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.flat_tops import ACC_FLOOR, GYRO_FLOOR, MAG_FLOOR, flat_tops
+from imu_fusion.samples.lasting_errors import check_force_errors
 from imu_fusion.samples.logs import AccelerometerLog, FixLog, ImuLog, MagLog
 from imu_fusion.samples.standing import check_standing
 from imu_fusion.samples.travel import check_alternating
@@ -298,7 +299,7 @@ def check_imu(log: ImuLog, name: str = "imu/data_raw") -> list[Finding]:
             *check_acceleration(log.acc, log.stamp, name),
             *check_gravity_sign(log.acc, log.stamp, name),
             *(check_standing(log, name) or check_turning(log, name)
-              or check_agreement(log, name)),
+              or check_agreement(log, name) or check_force_errors(log, name)),
             *check_held(np.hstack([log.gyr, log.acc]), log.stamp, name),
             *check_saturation(log.gyr, name, "angular velocity", "rad/s", GYRO_FLOOR),
             *check_saturation(log.acc, name, "acceleration", "m/s^2", ACC_FLOOR)]

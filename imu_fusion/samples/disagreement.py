@@ -54,7 +54,7 @@ def check_agreement(imu: ImuLog, name: str) -> list[Finding]:
         return []
     late, by_delay, at_once = _best_delay(windows)
     if abs(late) > _LATE and is_better(by_delay, at_once):
-        return [_late(late, "gravity", name)]
+        return [late_finding(late, "gravity", name)]
     left, recorded = _left(windows)
     return _other_scale(windows, recorded, "gravity", name) if left > _FITS_CALMLY else []
 
@@ -79,7 +79,7 @@ def check_field_agreement(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
     windows.keep(np.arange(min(len(windows), _MOST)))
     late, by_delay, at_once = _best_delay(windows, with_bias=True)
     if abs(late) > _LATE and is_better(by_delay, at_once):
-        return [_late(late, "the field", name)]
+        return [late_finding(late, "the field", name)]
     left, recorded = _left(windows, with_bias=True)
     if left < _FITS_CALMLY:
         return []
@@ -97,10 +97,11 @@ def _delay_when_shaken(windows, name):
             and np.median(by_delay / still) < _EXPLAINED
             and gain.mean() * np.sqrt(len(gain)) > _SURELY * gain.std()):
         return []
-    return [_late(late, "gravity", name)]
+    return [late_finding(late, "gravity", name)]
 
 
-def _late(late, what, name):
+def late_finding(late: float, what: str, name: str) -> Finding:
+    """A gyroscope that is ``late`` s later than what turns, gravity or the field."""
     other = "accelerometer" if what == "gravity" else "magnetometer"
     return Finding(
         "stamp", f"{name}: {what} turns as if the gyroscope were {abs(late) * 1e3:.0f} ms "

@@ -11,6 +11,7 @@ from imu_fusion.parameters.file import ParamsFile, parameters_for
 from imu_fusion.samples import checks
 from imu_fusion.samples.field_turning import check_axes
 from imu_fusion.samples.findings import Finding
+from imu_fusion.samples.lasting_errors import check_field_errors
 from imu_fusion.samples.travel import check_travel
 from imu_fusion.streams.stream import FIX_TOPIC, IMU_TOPIC, MAG_TOPIC, VELOCITY_TOPIC
 
@@ -27,7 +28,8 @@ def check_logs(logs: Mapping[str, Any]) -> list[Finding]:
         found += checks.check_mag(mag, MAG_TOPIC)
     if imu is not None and mag is not None:
         found += checks.check_clock(mag.stamp, imu.stamp, MAG_TOPIC)
-        found += check_axes(imu, mag, MAG_TOPIC)
+        found += (check_axes(imu, mag, MAG_TOPIC)
+                  or check_field_errors(imu, mag, MAG_TOPIC))
     return found
 
 

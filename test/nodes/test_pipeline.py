@@ -17,7 +17,7 @@ from imu_fusion.errors import EstimationError, LayoutError, TopicError
 from imu_fusion.messages.convert import fix_message, imu_message
 from imu_fusion.messages.layouts import FIX, IMU
 from imu_fusion.messages.typestore import TYPES
-from imu_fusion.nodes.pipeline import run_pipeline
+from imu_fusion.nodes.pipeline import plan_pipeline, run_pipeline
 from imu_fusion.nodes.processes import NodeProcesses
 from imu_fusion.nodes.recorder import Recorder
 from imu_fusion.nodes.replayer import Replayer
@@ -28,6 +28,7 @@ from imu_fusion.streams.smoother_messages import RESULTS_TOPIC, results_value
 from test.layouts import LAYOUTS
 from test.nodes.conftest import START, STEP, write_bag
 from test.nodes.test_smoother import write
+from test.test_bags import ROOT
 
 
 def fields(path, topics):
@@ -198,3 +199,8 @@ def test_processes_record_what_batch_writes(tmp_path):
     found = [json.loads((path / "results.json").read_text())["smoother"]
              for path in (tmp_path / "batch", out)]
     assert found[0] == found[1] and found[0]["samples"] == 400 and found[0]["remarks"] == []
+
+
+def test_estimators_whose_topics_are_not_recorded_take_no_part():
+    plan = plan_pipeline(ROOT / "bags" / "jump_simulated")
+    assert plan.estimators == ["orientation_estimator", "smoother"]

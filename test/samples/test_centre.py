@@ -8,7 +8,7 @@ import pytest
 
 from imu_fusion.estimation.smoother import Smoother, SmootherParams, hypotheses
 from imu_fusion.estimation.smoother.attempt import other_centre
-from imu_fusion.samples.centre import find_centre
+from imu_fusion.samples.centre import centre_in_flight, find_centre
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.simulation.avalanche import FLUELA, Avalanche
 from imu_fusion.simulation.ball_sensors import LEVER_ARM, BallErrors, record_ball
@@ -44,6 +44,23 @@ def test_what_rolls_about_one_axis_alone_has_none(ball):
     time, force, rate = ball
     assert find_centre(time, np.tile([0.0, 0.0, 9.81], (len(time), 1)),
                        np.outer(5.0 + np.abs(rate[:, 0]), [0.0, 0.0, 1.0])) is None
+
+
+def test_one_flight_of_a_second_tells_it(ball):
+    """But where on the axis of the turn it is; without the flight nothing does."""
+    time, force, rate = ball
+    flies = (time > 0.65) & (time < 1.45)
+    axis = rate[flies].mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    for chosen, found in ((time < 1.45, True), (time < 0.6, False)):
+        logs = [values[(time > -3.0) & chosen] for values in (time, force, rate)]
+        assert centre_in_flight(*logs, -np.array(LEVER_ARM)) is None
+        point = centre_in_flight(*logs, np.zeros(3))
+        assert (point is not None) == found
+        if found:
+            off = point + LEVER_ARM
+            assert np.linalg.norm(off - axis * (off @ axis)) < 0.004
+            assert abs(point @ axis) < 0.004     # as given
 
 
 @pytest.mark.parametrize(("lever_arm", "phase", "found"), [

@@ -20,7 +20,13 @@ from imu_fusion.errors import EstimationError, SampleError
 from imu_fusion.estimation.acceleration_field.affine import AffineFilter
 from imu_fusion.estimation.acceleration_field.kernel_params import kernel_params
 from imu_fusion.estimation.acceleration_field.maximum_likelihood import fit_densities
-from imu_fusion.estimation.acceleration_field.motion_model import BIAS, State, parts
+from imu_fusion.estimation.acceleration_field.motion_model import (
+    ALPHA,
+    BIAS,
+    OMEGA,
+    State,
+    parts,
+)
 from imu_fusion.estimation.acceleration_field.params import (
     AccelerationFieldParams,
     AccelerometerParams,
@@ -38,6 +44,9 @@ from imu_fusion.estimation.acceleration_field.sensor_faults import (
 )
 from imu_fusion.estimation.acceleration_field.standing_axes import StandingAxes
 from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
+from imu_fusion.estimation.acceleration_field.wrong_start import turn_to_reckon_with
+
+_BARE = 3    # samples in which accelerometers at their limits leave too few: worth a remark
 
 
 class AccelerationFieldEstimator:
@@ -117,6 +126,11 @@ class AccelerationFieldEstimator:
             found.append(f"{name}: stands at its limit of {known} {unit.get(name, 'm/s^2')} and is "
                          f"not used there: set {where}, and take a sensor of a larger range if the "
                          "others are at theirs, too")
+        bare, samples = self._limits.bare.tolist()
+        if bare >= _BARE:
+            found.append(f"accelerometers at their limits leave too few channels in {bare} of "
+                         f"{samples} samples to check or even to tell how it moves: what follows "
+                         "may be further off than stated; take sensors of a larger range")
         return found
 
     @property
@@ -136,7 +150,7 @@ class AccelerationFieldEstimator:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else self._filter.get_state(),
                 "start": self._start, "rest": self._rest, "last": self._last, "waits": self._waits,
-                "limits": (self._limits.found.copy(), self._limits.steps.copy()),
+                "limits": self._limits.get_state(),
                 "standing": (self._standing.found.copy(), self._standing.others.copy()),
                 "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
@@ -146,7 +160,7 @@ class AccelerationFieldEstimator:
         self._start, self._rest, self._last = state["start"], state["rest"], state["last"]
         self._waits = state["waits"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
-        self._limits.found, self._limits.steps = (part.copy() for part in state["limits"])
+        self._limits.set_state(state["limits"])
         self._standing.found, self._standing.others = (part.copy() for part in state["standing"])
         self._late = list(state["late"])
         self._filter = None
@@ -204,6 +218,7 @@ class AccelerationFieldEstimator:
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
         limits = RangeLimits(self.array)
         limits.mark(readings)    # first what the whole recording tells of them
+        limits.bare[:] = 0
         standing = StandingAxes(self.params, self.array)
         readings = standing.mark(self._channels(limits.mark(readings)))
         params = self.params
@@ -278,8 +293,10 @@ class AccelerationFieldEstimator:
     def _still_rows(self, stamp, start):
         x = parts(start.x)
         rows = np.empty(len(stamp), ROW)
+        doubt = np.zeros(BIAS)
+        doubt[OMEGA:ALPHA] = turn_to_reckon_with(start.about)
         put_still_rows(kernel_params(self.params, self.array), stamp, start.quat, x.omega, x.alpha,
-                       x.acc, np.ascontiguousarray(start.cov[:BIAS, :BIAS]), rows)
+                       x.acc, np.ascontiguousarray(start.cov[:BIAS, :BIAS]), doubt, rows)
         return rows
 
     def _begin(self):

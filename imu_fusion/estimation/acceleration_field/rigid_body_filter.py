@@ -57,7 +57,11 @@ from imu_fusion.estimation.acceleration_field.params import AccelerationFieldPar
 from imu_fusion.estimation.acceleration_field.rows import GAP, HELD, ROW, put_rigid_row
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
-from imu_fusion.estimation.acceleration_field.wrong_start import fit_start, move_on
+from imu_fusion.estimation.acceleration_field.wrong_start import (
+    doubt_of_start,
+    fit_start,
+    move_on,
+)
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 from imu_fusion.kernels import njit
 
@@ -170,9 +174,10 @@ def _put(row, p, channels, state, exact):
     """Fill a ROW by the State, moved to where the hypothesis that the mounting is exact has it, as
     far as that counts; that much further its mean may be off."""
     cov, part = widening(state.x, channels) * state.cov[:BIAS, :BIAS], share(exact)
-    s = parts(state.x)
+    s, doubt = parts(state.x), np.empty(BIAS)
+    doubt_of_start(state, doubt)
     if part == 0.0:
-        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc, cov)
+        put_rigid_row(row, p, state.quat, s.omega, s.alpha, s.acc, cov, doubt)
         return
     change = part * change_of(exact, state.cov)
     for i in range(BIAS):
@@ -180,7 +185,7 @@ def _put(row, p, channels, state, exact):
             cov[i, j] += change[i] * change[j]
     d = parts(change)
     put_rigid_row(row, p, quat_normalize(quat_multiply(state.quat, quat_exp(d.theta))),
-                  s.omega + d.omega, s.alpha + d.alpha, s.acc + d.acc, cov)
+                  s.omega + d.omega, s.alpha + d.alpha, s.acc + d.acc, cov, doubt)
 
 
 @njit

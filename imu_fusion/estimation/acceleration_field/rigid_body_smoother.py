@@ -19,6 +19,8 @@ from imu_fusion.estimation.acceleration_field.misfit import widening
 from imu_fusion.estimation.acceleration_field.motion_model import (
     ALPHA,
     BIAS,
+    OMEGA,
+    THETA,
     State,
     motion_step,
     multiply_transition_transposed,
@@ -35,6 +37,7 @@ from imu_fusion.estimation.acceleration_field.rows import (
 )
 from imu_fusion.estimation.acceleration_field.sensor_array import SensorArray
 from imu_fusion.estimation.acceleration_field.start import Start
+from imu_fusion.estimation.acceleration_field.wrong_start import turn_to_reckon_with
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 from imu_fusion.kernels import njit
 
@@ -185,7 +188,8 @@ def smooth(params: AccelerationFieldParams, array: SensorArray, start: Start,
         at = found.mean
     rows = np.empty(len(stamp), ROW)
     _put_smoothed(kernel_params(params, array), array.channels, stamp, readings, found.used,
-                  found.mean, found.cov, start.quat.copy(), rows)
+                  found.mean, found.cov, start.quat.copy(),
+                  turn_to_reckon_with(start.about, first[0]), rows)
     found.last.adaptation["vague"] = vague
     for name in ("score", "information"):
         found.last.adaptation[name] = first[name]
@@ -235,10 +239,13 @@ def _toward_exact(array, last):
 
 
 @njit
-def _put_smoothed(par, channels, stamp, readings, used, mean, cov, quat, rows):
+def _put_smoothed(par, channels, stamp, readings, used, mean, cov, quat, turn, rows):
     """One of ``rows`` (n,) ROW for each smoothed mean (n, N) and covariance (n, 18, 18); used:
-    (n, m) bool. quat (4,) of the start is changed."""
+    (n, m) bool. quat (4,) of the start is changed. turn: (3,) rad/s, by which the body may have
+    turned all along."""
     p = par[0]
+    doubt = np.zeros(BIAS)
+    doubt[OMEGA:ALPHA] = turn
     s = parts(mean)
     quat[:] = quat_normalize(quat_multiply(quat, quat_exp(s.theta[0])))
     for n in range(len(stamp)):
@@ -256,8 +263,9 @@ def _put_smoothed(par, channels, stamp, readings, used, mean, cov, quat, rows):
                 quat[:] = quat_normalize(quat_multiply(quat, quat_exp(phi)))
         _put_residual(row, p, channels, readings[n], used[n], mean[n])
         own = parts(mean[n])
+        doubt[THETA:OMEGA] = turn * ((stamp[n] - stamp[0]) * 1e-9)
         put_rigid_row(row, p, quat, own.omega, own.alpha, own.acc,
-                      widening(mean[n], channels) * cov[n])
+                      widening(mean[n], channels) * cov[n], doubt)
 
 
 @njit

@@ -26,6 +26,8 @@ GAP = 4          # the time since the previous sample exceeds gap.max
 HELD = 8         # too few channels: carried on without a fit
 LEFT_OUT = 16    # a sensor contradicts the others or stands still, and was not used
 
+_ASIDE = 0.07    # of a turn about the vertical that is doubted, by what accelerometers are off
+
 ROW = np.dtype([
     ("stamp", "i8"),
     ("gradient", "f8", (3, 3)),          # P of the paper, 1/s^2
@@ -89,9 +91,10 @@ def put_row(row, p, quat, omega, alpha, acc, cov, gradient):
 
 
 @njit
-def put_rigid_row(row, p, quat, omega, alpha, acc, cov):
+def put_rigid_row(row, p, quat, omega, alpha, acc, cov, doubt):
     """:func:`put_row` of a rigid body, whose gradient follows from omega and alpha: its mean, and
-    what products of two errors of omega add to the covariance of the field at the origin."""
+    what products of two errors of omega add to the covariance of the field at the origin. ``doubt``
+    (18,): one more error of the state, which the mean leaves out, a standard deviation."""
     known = cov[OMEGA:ALPHA, OMEGA:ALPHA]
     spin = known[0, 0] + known[1, 1] + known[2, 2]
     gradient = rigid_gradient(omega, alpha) + known
@@ -99,6 +102,11 @@ def put_rigid_row(row, p, quat, omega, alpha, acc, cov):
     for i in range(3):
         gradient[i, i] -= spin
         lever += p.reference[i] * p.reference[i]
+    if np.any(doubt):
+        cov = cov + np.outer(doubt, doubt)
+        turn = doubt[OMEGA] ** 2 + doubt[OMEGA + 1] ** 2 + doubt[OMEGA + 2] ** 2
+        for i in range(OMEGA, ALPHA):
+            cov[i, i] += _ASIDE * _ASIDE * turn
     put_row(row, p, quat, omega, alpha, acc, cov, gradient)
     for i in range(3):
         row.cov_specific_force[i, i] += 0.5 * lever * spin * spin
@@ -106,14 +114,14 @@ def put_rigid_row(row, p, quat, omega, alpha, acc, cov):
 
 
 @njit
-def put_still_rows(par, stamp, quat, omega, alpha, acc, cov, rows):
+def put_still_rows(par, stamp, quat, omega, alpha, acc, cov, doubt, rows):
     """One of ``rows`` (n,) ROW for each stamp (n,) at which the state was the same; the other
     arguments are those of :func:`put_rigid_row`."""
     for n in range(len(stamp)):
         rows[n].stamp = stamp[n]
         rows[n].flags = 0
         rows[n].residual_rms = np.nan
-        put_rigid_row(rows[n], par[0], quat, omega, alpha, acc, cov)
+        put_rigid_row(rows[n], par[0], quat, omega, alpha, acc, cov, doubt)
 
 
 @njit

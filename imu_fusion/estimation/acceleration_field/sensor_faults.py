@@ -15,8 +15,10 @@ _SAMPLES = 10       # left out: fewer are single wild readings, without a cause 
 _EXPLAINED = 0.15   # of the squares of a contradiction that a cause may leave over
 _STILL = 1e-3       # of the squares expected, by which the readings of a dead sensor may vary
 _BEYOND = 4.0       # of its standard deviation: a mounting that is not as described
-_FAR = 6.0          # of it: a bias, which takes up errors of the motion, too
+_FAR = 4.5          # of it: a bias, which takes up errors of the motion, too
 _UNLIKELY = 0.01    # chance of mountings that, taken together, are further off: worth a remark
+_HARDLY = 1e-5      # and of biases
+_BLURS = 2.0        # of the share that positions are off by, of the turning that passes for it
 _WIDER = 3.0        # times a standard deviation: an adaptation worth a remark
 _NOISIER = 1.25     # as much for the noise, if it lasts: data that fit never change it
 _SHARE = 0.1        # of the samples, in which noise may be larger, or the rate hardly known
@@ -146,23 +148,35 @@ def fit_remarks(fits: list[SensorFit], array: SensorArray, params: AccelerationF
             f"the motion is up to {motion:.2g} times wilder than its densities say, for "
             f"{adaptation['samples'][1]} samples, in which they are taken to be larger: raise "
             "motion.jerk_density and motion.acceleration_rate_density, or use maximum_likelihood")
-    return remarks + start_remarks(adaptation, params.initial)
+    felt = array.channels[~array.channels["is_gyro"]]
+    blurred = _BLURS * float(felt["position_sd"].max()) / max(array.radius, 1e-12)
+    return remarks + start_remarks(adaptation, params.initial, blurred)
 
 
 def _biases(fits, array, state):
-    """Texts on accelerometers whose biases are far beyond what was said of them."""
+    """Texts on accelerometers whose biases are far beyond what was said of them, each, or taken
+    together: those that drift have been smaller."""
     remarks = []
+    squares, number = 0.0, 0
     for k, fit in enumerate(fits):
         own = np.flatnonzero(array.channels["sensor"] == k)
         bias, sd = state.x[BIAS + own], array.channels["bias_sd"][own[0]]
-        if fit.fault or array.channels["bias_walk"][own[0]] > 0.0 or np.all(
-                np.abs(bias) <= _FAR * sd):
+        if fit.fault or array.channels["bias_walk"][own[0]] > 0.0 or sd == 0.0:
+            continue
+        squares += float(np.sum((bias / sd) ** 2))
+        number += len(own)
+        if np.all(np.abs(bias) <= _FAR * sd):
             continue
         axes = ", ".join("xyz"[column % 3] for column in array.channels["column"][own])
         remarks.append(
             f"accelerometer '{fit.name}' fits best with biases of {_vector(bias, 2)} m/s^2 "
             f"({axes}), far beyond their sd of {sd:.2g}; what is stated is larger by as much: "
-            f"calibrate it, or raise accelerometers.{fit.name}.bias_sd")
+            f"calibrate it, or raise accelerometers.{fit.name}.bias_sd (bias_walk, if it drifts)")
+    if not remarks and number and squares > scipy.special.chdtri(number, _HARDLY):
+        remarks = ["the biases of the accelerometers, taken together, fit best "
+                   f"{np.sqrt(squares / number):.2g} times as large as their sds say; what is "
+                   "stated is larger by as much: calibrate them, or raise sensor.acc_bias_sd "
+                   "(sensor.acc_bias_walk, if they drift)"]
     return remarks
 
 

@@ -7,10 +7,14 @@ later innovations is followed beside the filter, and these errors are fitted to 
 likelihood ratio: Willsky and Jones 1976).
 """
 
+import math
+
 import numpy as np
 
 from imu_fusion.estimation.acceleration_field.cross_check import turns
 from imu_fusion.estimation.acceleration_field.motion_model import (
+    ALPHA,
+    BIAS,
     OMEGA,
     multiply_transition,
     transition,
@@ -79,24 +83,67 @@ def _squares(state):
     return squares
 
 
-def start_remarks(adaptation: np.ndarray, initial: Initial) -> list[str]:
-    """What an ADAPTATION says of the start."""
+@njit
+def turned_unseen(about, score, information):
+    """The turn (rad/s) about the unit vector of ``about`` (3,) that must be reckoned with at the
+    start, as a standard deviation: any up to that, until motion tells; none where it tells none,
+    and what it tells, where that is surely one. Whether motion has told is the second."""
+    largest = math.sqrt(about[0] ** 2 + about[1] ** 2 + about[2] ** 2)
+    if largest == 0.0:
+        return 0.0, True
+    known, pull = 0.0, 0.0
+    for i in range(3):
+        pull += about[i] / largest * score[i]
+        for j in range(3):
+            known += about[i] * information[i, j] * about[j] / largest ** 2
+    if known * largest ** 2 < _TOLD ** 2:
+        return largest / math.sqrt(3.0), False
+    turn = abs(pull) / known
+    return (turn if turn > max(_SLOW, _SURELY / math.sqrt(known)) else 0.0), True
+
+
+def turn_to_reckon_with(about: np.ndarray, adaptation: np.ndarray | None = None) -> np.ndarray:
+    """That turn (3,) rad/s, by what an ADAPTATION, if any, says of it."""
+    score, information = (np.zeros(3), np.zeros((3, 3))) if adaptation is None else (
+        adaptation["score"], adaptation["information"])
+    turn, _ = turned_unseen(about, score, information)
+    return about * (turn / max(float(np.linalg.norm(about)), 1e-12))
+
+
+@njit
+def doubt_of_start(state, doubt):
+    """What the turn that must be reckoned with makes of the first states, into doubt (18,)."""
+    adaptation = state.adaptation[0]
+    turn, told = turned_unseen(adaptation.about, adaptation.score, adaptation.information)
+    doubt[:] = 0.0
+    if turn > 0.0:
+        about = adaptation.about
+        scale = turn / math.sqrt(about[0] ** 2 + about[1] ** 2 + about[2] ** 2)
+        for i in range(BIAS):
+            for j in range(3):
+                doubt[i] += scale * about[j] * state.error[i, j]
+        # As far as that is from none, no linear update tells of it.
+        if not told:
+            doubt[OMEGA:ALPHA] = scale * about
+
+
+def start_remarks(adaptation: np.ndarray, initial: Initial, blurred: float) -> list[str]:
+    """What an ADAPTATION says of the start. blurred: share of a turn that errors of the mounting
+    may make up."""
     score, information, about = (adaptation[name] for name in ("score", "information", "about"))
     advice = ("add a gyroscope (use_gyro: true), or give initial.angular_velocity (initial.mode "
               "given)")
     largest = float(np.linalg.norm(about))
     if largest > 0.0:
-        up = about / largest
-        known = float(up @ information @ up)
-        turn = float(up @ score) / max(known, 1e-12)
-        if known * largest ** 2 < _TOLD ** 2:
+        turn, told = turned_unseen(about, score, information)
+        if not told:
             return [] if largest < _TOLD * initial.angular_velocity_sd else [
                 f"accelerometers alone do not tell rest, as it was taken, from a steady turn about "
-                f"the vertical by up to {largest:.2g} rad/s, and no motion since has told: where "
-                f"it may have turned, {advice}"]
-        if abs(turn) > max(_SLOW, _SURELY / np.sqrt(known)):
+                f"the vertical by up to {largest:.2g} rad/s, and no motion since has told; what is "
+                f"stated is larger by that: where it may have turned, {advice}"]
+        if turn > 0.0:
             return ["the motion says that the body turned by some "
-                    f"{abs(turn):.2g} rad/s about the vertical where it was taken for still: what "
+                    f"{turn:.2g} rad/s about the vertical where it was taken for still: what "
                     f"is before it is wrong; {advice}"]
         return []
     if initial.mode == "rest":    # with a gyroscope
@@ -106,7 +153,8 @@ def start_remarks(adaptation: np.ndarray, initial: Initial) -> list[str]:
     size, axes = size[told], axes[:, told]
     off = axes @ (axes.T @ score / size)
     length, spread = float(np.linalg.norm(off)), np.sqrt(np.sum((axes.T @ off) ** 2 / size))
-    if length * length > max(_SLOW * length, _SURELY * spread):
+    slow = _SLOW + blurred * float(np.linalg.norm(initial.angular_velocity))
+    if length * length > max(slow * length, _SURELY * spread):
         text = ", ".join(f"{value:.1f}" for value in off)
         return [f"the motion says that the body turned by some ({text}) rad/s more than "
                 "initial.angular_velocity says: correct it, or raise initial.angular_velocity_sd"]

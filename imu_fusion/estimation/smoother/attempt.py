@@ -40,7 +40,7 @@ from imu_fusion.estimation.smoother.surroundings import surroundings_of
 from imu_fusion.estimation.smoother.touch_down import FOLLOWS, likeliest, near_ground
 from imu_fusion.estimation.smoother.whiteness import wandering, widen
 from imu_fusion.geometry.geodesy import LocalFrame
-from imu_fusion.samples.centre import find_centre
+from imu_fusion.samples.centre import centre_in_flight, find_centre
 from imu_fusion.samples.logs import FixLog, ImuLog, MagLog, VelocityLog, seconds
 from imu_fusion.surfaces.constraint import Surface, split_sigma
 from imu_fusion.surfaces.hill import PARTS, Hill
@@ -352,11 +352,13 @@ def other_centre(problem: Problem) -> np.ndarray | None:
     if surface.lever_arm_sd or not any(c.phase == "always" for c in problem.constraints):
         return None
     log = problem.imu.log
-    found = find_centre(seconds(log.stamp, log.stamp[0]), log.acc, log.gyr)
-    if found is None:
-        return None
-    off = np.abs(found.point - surface.lever_arm)
-    return found.point if np.any(off > _OFF_CENTRE * np.hypot(found.sd, _CENTRE_SD)) else None
+    time = seconds(log.stamp, log.stamp[0])
+    found = find_centre(time, log.acc, log.gyr)
+    if found is not None:
+        off = np.abs(found.point - surface.lever_arm)
+        if np.any(off > _OFF_CENTRE * np.hypot(found.sd, _CENTRE_SD)):
+            return found.point
+    return centre_in_flight(time, log.acc, log.gyr, surface.lever_arm)
 
 
 def clipped_forces(problem: Problem) -> tuple[int, float]:

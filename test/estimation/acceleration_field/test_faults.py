@@ -281,7 +281,8 @@ def test_ranges_are_found_and_have_a_tolerance(impact):
     at_limit = (np.abs(readings) >= limit).any(axis=(1, 2))
     # As a data sheet rounds it, above what the chip gives.
     rows, remarks, *_ = judged(impact, readings, layout(range=(78.4533,)))
-    assert np.array_equal(rows["flags"] & SATURATED > 0, at_limit) and remarks == []
+    assert np.array_equal(rows["flags"] & SATURATED > 0, at_limit)
+    assert all("leave too few channels" in text for text in remarks)
     rows, remarks, *_ = judged(impact, readings)
     found = rows["flags"] & SATURATED > 0
     assert not np.any(found & ~at_limit) and found.sum() > 0.8 * at_limit.sum()
@@ -327,12 +328,37 @@ def test_the_papers_method_says_what_it_leaves_out(impact):
         assert bool(estimator.remarks()) is said
 
 
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+def test_a_range_that_is_given_too_large_is_found_all_the_same(impact, mode):
+    readings = np.clip(felt(impact), -80.0, 80.0)
+    (rows, remarks, *_), (alike, *_) = (
+        judged(impact, readings, layout(**given), mode=mode) for given in ({"range": (81.0,)}, {}))
+    assert any("left: stands at its limit of 80" in text for text in remarks)
+    assert np.array_equal(rows["specific_force"], alike["specific_force"])
+
+
+def test_limits_that_leave_too_few_channels_are_said(impact):
+    readings = np.clip(felt(impact), -50.0, 50.0)
+    for limit, said in ((49.9, True), (500.0, False)):
+        sound = felt(impact) if limit > 50.0 else readings
+        remarks = judged(impact, sound, layout(range=(limit,)))[1]
+        assert any("leave too few channels" in text for text in remarks) is said
+
+
 def test_a_bias_far_beyond_its_sd_is_named(impact):
     readings = felt(impact)
     assert judged(impact, readings)[1] == []
     readings[:, 1, 0] += 2.0
     assert any("'left' fits best with biases of (1." in text and "left.bias_sd" in text
                for text in judged(impact, readings)[1])
+
+
+@pytest.mark.parametrize("seed", [8, 17])    # of twenty, those whose biases get the least far
+def test_biases_that_drift_are_named(impact, seed):
+    t = np.linspace(0.0, 1.0, len(impact.stamp))[:, None, None]
+    end = np.random.default_rng(seed).choice([-1.0, 1.0], (1, 4, 3))
+    remarks = judged(impact, felt(impact) + 0.8 * t * end)[1]
+    assert any("biases" in text and "bias_walk" in text for text in remarks), remarks
 
 
 @pytest.mark.parametrize("scale, turn, said", [(1.0, 0.0, None), (1.1, 0.0, "gyro_scale_sd"),
@@ -403,8 +429,14 @@ def test_rest_and_a_steady_turn_about_the_vertical_are_told_apart_by_a_later_mot
     readings = np.einsum("kij,nkj->nki", turned, field)
     readings += random.normal(0, 0.1, (1, 4, 3)) + random.normal(0, NOISE, readings.shape)
     estimator = AccelerationFieldEstimator(AccelerationFieldParams(gravity=9.8), layout())
-    estimator.run(np.round(t * 1e9).astype(np.int64), readings)
+    rows = estimator.run(np.round(t * 1e9).astype(np.int64), readings)
     remarks = estimator.remarks()
+    # What is said widens what is stated; once motion has told of rest, nothing does.
+    off = np.abs(rate - rows["omega"])[:700]
+    sd = np.sqrt(np.einsum("nii->ni", rows["cov_omega"]))
+    assert np.all(off <= 3.0 * sd[:700])
+    assert sd[600, 2] > 1.0 and sd[600, :2].max() < 0.2
+    assert not (tumbles and speed == 0.0) or sd[-1].max() < 0.2
     if said is None:
         assert remarks == []
     else:
