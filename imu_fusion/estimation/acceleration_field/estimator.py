@@ -46,6 +46,8 @@ from imu_fusion.estimation.acceleration_field.standing_axes import StandingAxes
 from imu_fusion.estimation.acceleration_field.start import Start, given_start, is_still, rest_start
 from imu_fusion.estimation.acceleration_field.wrong_start import turn_to_reckon_with
 
+_BARE = 3    # samples in which accelerometers at their limits leave too few: worth a remark
+
 
 class AccelerationFieldEstimator:
     """Acceleration field, angular velocity and orientation of a rigid body.
@@ -124,6 +126,11 @@ class AccelerationFieldEstimator:
             found.append(f"{name}: stands at its limit of {known} {unit.get(name, 'm/s^2')} and is "
                          f"not used there: set {where}, and take a sensor of a larger range if the "
                          "others are at theirs, too")
+        bare, samples = self._limits.bare.tolist()
+        if bare >= _BARE:
+            found.append(f"accelerometers at their limits leave too few channels in {bare} of "
+                         f"{samples} samples to check or even to tell how it moves: what follows "
+                         "may be further off than stated; take sensors of a larger range")
         return found
 
     @property
@@ -143,7 +150,7 @@ class AccelerationFieldEstimator:
         """Everything that a later :meth:`set_state` needs to go on from here."""
         return {"filter": None if self._filter is None else self._filter.get_state(),
                 "start": self._start, "rest": self._rest, "last": self._last, "waits": self._waits,
-                "limits": (self._limits.found.copy(), self._limits.steps.copy()),
+                "limits": self._limits.get_state(),
                 "standing": (self._standing.found.copy(), self._standing.others.copy()),
                 "late": list(self._late),
                 "stamps": list(self._stamps), "readings": list(self._readings)}
@@ -153,7 +160,7 @@ class AccelerationFieldEstimator:
         self._start, self._rest, self._last = state["start"], state["rest"], state["last"]
         self._waits = state["waits"]
         self._stamps, self._readings = list(state["stamps"]), list(state["readings"])
-        self._limits.found, self._limits.steps = (part.copy() for part in state["limits"])
+        self._limits.set_state(state["limits"])
         self._standing.found, self._standing.others = (part.copy() for part in state["standing"])
         self._late = list(state["late"])
         self._filter = None
@@ -211,6 +218,7 @@ class AccelerationFieldEstimator:
         stamp, readings = np.concatenate(self._stamps), np.concatenate(self._readings)
         limits = RangeLimits(self.array)
         limits.mark(readings)    # first what the whole recording tells of them
+        limits.bare[:] = 0
         standing = StandingAxes(self.params, self.array)
         readings = standing.mark(self._channels(limits.mark(readings)))
         params = self.params

@@ -13,12 +13,16 @@ from imu_fusion.samples.flat_tops import (
     start_flat_tops,
 )
 
+_LOWER = 0.998    # times a range that is given: a limit that is another one
+_NEEDED = 6       # channels that a and alpha take
+
 
 class RangeLimits:
     """What is known of the ranges of an array's sensors, by their samples so far.
 
     ``found`` (K,) FLAT_TOPS and ``steps`` (K, 3), the smallest by which an axis has changed; the
-    gyroscope last.
+    gyroscope last. ``beside`` (K,) FLAT_TOPS as if no range were given: one may be lower than that.
+    ``bare`` (2,) int, samples in which limits leave no more channels than are needed, of all.
     """
 
     def __init__(self, array: SensorArray) -> None:
@@ -27,9 +31,22 @@ class RangeLimits:
         channels = array.channels[np.isfinite(array.channels["range"])]
         self._ranges.reshape(-1)[channels["column"]] = channels["range"]
         self._accelerometers = array.accelerometers
+        self._felt = array.channels["column"][~array.channels["is_gyro"]]
+        self._unknown = np.full((number, 3), np.nan)
         self.found = np.zeros(number, FLAT_TOPS)
+        self.beside = np.zeros(number, FLAT_TOPS)
+        self.bare = np.zeros(2, np.int64)
         self.steps = np.full((number, 3), np.inf)
         _start(self.found, self._ranges)
+        _start(self.beside, self._unknown)
+
+    def get_state(self) -> tuple[np.ndarray, ...]:
+        """A copy of what is known, for :meth:`set_state`."""
+        return self.found.copy(), self.steps.copy(), self.beside.copy(), self.bare.copy()
+
+    def set_state(self, state: tuple[np.ndarray, ...]) -> None:
+        """Go on from where :meth:`get_state` was called."""
+        self.found, self.steps, self.beside, self.bare = (part.copy() for part in state)
 
     def mark(self, readings: np.ndarray) -> np.ndarray:
         """Readings (n, 3 K) of all sensors, with inf for those at a limit.
@@ -40,12 +57,22 @@ class RangeLimits:
         marked = readings.copy()
         _mark(self.found, self.steps, self._ranges, self._accelerometers,
               marked.reshape(len(readings), -1, 3))
+        if np.isfinite(self._ranges).any():
+            others = readings.copy()
+            _mark(self.beside, self.steps, self._unknown, self._accelerometers,
+                  others.reshape(len(readings), -1, 3))
+            marked[np.isposinf(others)] = np.inf
+        felt = marked[:, self._felt]
+        self.bare += (np.sum(np.isposinf(felt).any(axis=1)
+                             & (np.isfinite(felt).sum(axis=1) <= _NEEDED)), len(felt))
         return marked
 
     @property
     def learnt(self) -> np.ndarray:
         """Limits (K, 3) that were found, not given; inf where there are none."""
-        return np.where(np.isnan(self._ranges), self.found["limit"], np.inf)
+        beside = self.beside["limit"]
+        return np.where(np.isnan(self._ranges), self.found["limit"],
+                        np.where(beside < _LOWER * self._ranges, beside, np.inf))
 
 
 @njit

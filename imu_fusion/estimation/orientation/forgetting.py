@@ -6,6 +6,8 @@ from imu_fusion.estimation.orientation.state import MOST_REFUTING
 from imu_fusion.geometry.rotation import quat_rotate
 from imu_fusion.kernels import njit
 
+_LASTING = 1.0    # s, in which a body that nobody sees turns goes on to turn as it did
+
 
 @njit
 def allow_for_gap(s, p):
@@ -18,6 +20,22 @@ def allow_for_gap(s, p):
     for i in range(3):
         s.block.noise[es.ATTITUDE + i] += unseen
     _forget_motion(s, p)
+
+
+@njit
+def allow_for_stuck(s, p, lasted, is_new):
+    """The gyroscope is stuck since ``lasted`` s: nothing is known of how the body turns.
+
+    is_new: whether it was not known before."""
+    s.step.flags |= FLAG_GAP
+    s.rest.since = s.rest.changed = s.stamp
+    s.rest.settled = 0
+    if is_new:
+        _forget_motion(s, p)
+    time = lasted if is_new else s.step.dt
+    for i in range(3):
+        if s.cov[es.ATTITUDE + i, es.ATTITUDE + i] < es.UNIFORM_VARIANCE:
+            s.block.noise[es.ATTITUDE + i] += p.gap.rate_sd ** 2 * time * min(lasted, _LASTING)
 
 
 @njit

@@ -20,6 +20,7 @@ from imu_fusion.estimation.orientation import (
     clipped_rate,
     forgetting,
     gyro_limit,
+    gyro_repeats,
     hard_iron,
     imu_rejection,
     mag_queue,
@@ -122,11 +123,14 @@ def _begin_step(s, p, stamp, sample):
     s.stamp = stamp
     step.flags = s.waiting_flags
     s.waiting_flags = 0
+    stuck = gyro_repeats.is_stuck(s)    # before the search for limits takes the sample
     clipped = gyro_limit.find(s.gyro_limit, p.sensor.gyro_range, step.gyr[:])
     if clipped:
         step.flags |= FLAG_SATURATED | clipped << SATURATED_AXES_SHIFT
         s.counts.saturated += 1
-    if spike.hold(s.gyro_spike, step.gyr[:], s.gyr_last[:], step.dt, spike.WILD_RATE,
+    if stuck and not clipped:
+        gyro_repeats.allow_for(s, p)
+    elif spike.hold(s.gyro_spike, step.gyr[:], s.gyr_last[:], step.dt, spike.WILD_RATE,
                   step.missed[:]):
         step.flags |= FLAG_HELD
         s.counts.rates_held += 1
@@ -177,11 +181,12 @@ def _take_mags(s, p):
     if count == 0:
         return
     step.mag_count = count
-    if p.seeks_iron and (s.clipped or s.step.dt > p.gap.max):
+    lost = s.clipped or s.gyro_repeats.is_stuck
+    if p.seeks_iron and (lost or s.step.dt > p.gap.max):
         hard_iron.interrupt(s.hard_iron)
     for n in range(count):
         sample = taken[n]
-        if p.seeks_iron and not s.clipped:
+        if p.seeks_iron and not lost:
             then = quat_multiply(s.history.quat, sample.turn)
             if hard_iron.add(s.hard_iron, s.stamp, then, sample.field):
                 s.iron_shown = True
@@ -208,8 +213,8 @@ def _end_block(s, p, tape):
     error = np.zeros(es.N)
     known, placed = s.log_likelihood, s.position_likelihood
     correct(s, p, error, tape)
-    if s.clipped or s.was_clipped:
-        # What a clipped rate was is a guess: its misfit is no evidence of the surroundings.
+    if s.clipped or s.was_clipped or s.gyro_repeats.is_stuck:
+        # What the rate was is a guess: its misfit is no evidence of the surroundings.
         s.log_likelihood, s.position_likelihood = known, placed
     _add_error(s, p, error)
     magnetometer.judge_anchor(s, p)

@@ -35,6 +35,7 @@ _EVIDENCE = math.log(1000.0)
 # What places do within a window before there are any, of the field, per axis; counted as so many
 # windows. Errors within one window count as one: places last.
 _USUAL_SD, _USUAL_WINDOWS = 0.1, 4.0
+_STANDS = 100              # samples
 _FURTHER = 14.156          # squared distance (3 sigma) beyond which an offset is corrected again
 
 HARD_IRON = np.dtype([
@@ -185,13 +186,20 @@ def search(iron: np.ndarray, stamps: np.ndarray, gyr: np.ndarray, limits: np.nda
     newest = np.maximum.accumulate(stamps)
     kept = np.append(True, newest[1:] > newest[:-1])
     stamps, gyr = stamps[kept], np.ascontiguousarray(gyr[kept])
-    lost = (saturated_axes(gyr, limits).any(axis=1)
+    lost = (saturated_axes(gyr, limits).any(axis=1) | _stands(gyr)
             | (np.diff(stamps, prepend=stamps[:1]) > params.gap.max * 1e9))
     tried = iron[:1].copy()
     found = bool(_search(tried, np.zeros(1, REPEATS), stamps, gyr - bias, lost, mag_stamps, mags,
                          params.sensor.mag_noise_sd, params.fusion.mag_offset_sd))
     iron[:] = tried
     return found
+
+
+def _stands(gyr):
+    """Mask (n,) of rates (n, 3) that repeat for long: at rest, which shows nothing, or stuck."""
+    begins = np.flatnonzero(np.append(True, (gyr[1:] != gyr[:-1]).any(axis=1)))
+    lengths = np.diff(np.append(begins, len(gyr)))
+    return np.repeat(lengths >= _STANDS, lengths)
 
 
 @njit

@@ -29,7 +29,8 @@ def is_stale(kept, stamp, value, quat, noise_sd):
 
     Args:
         kept: a REPEATS, in place.
-        stamp: int64 ns. value: (3,) T, imu axes.
+        stamp: int64 ns.
+        value: (3,) T, imu axes.
         quat: (4,) attitude of the imu in axes that stand still.
         noise_sd: T, per axis.
     """

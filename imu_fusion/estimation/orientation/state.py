@@ -60,6 +60,19 @@ MOTION = np.dtype([
 ], align=True)
 """How much more the body moves than was said (motion_scale)."""
 
+GYRO_REPEATS = np.dtype([
+    ("count", "i8"),                     # samples that repeat the present value
+    ("longest", "i8"),                   # of them, of a gyroscope that was not stuck
+    ("is_stuck", "?"),
+    ("since", "i8"),                     # ns, stamp of the first of them
+    ("begun", "i8"),                     # ns, stamp at which it was found to be stuck
+    ("force", "f8", 3),                  # m/s^2, mean force there
+    ("quat", "f8", 4),                   # attitude there, in axes that stand still
+    ("stuck", "i8"),                     # ns, longest time that it was
+], align=True)
+"""The search for a stuck gyroscope (gyro_repeats)."""
+
+
 WANDER = np.dtype([
     ("velocity", "f8", 2),               # low-passed normalised innovations, horizontal
     ("field", "f8"),                     # of the field, across its horizontal part
@@ -145,6 +158,7 @@ STATE = np.dtype([
     ("mag_limit", FLAT_TOPS),            # the search for the magnetometer's range (mag_rejection)
     ("mag_repeats", REPEATS),            # and for samples that are old ones (mag_repeats)
     ("gyro_limit", FLAT_TOPS),           # and the gyroscope's (gyro_limit)
+    ("gyro_repeats", GYRO_REPEATS),
     ("gyro_spike", SPIKE),
     ("acc_spike", SPIKE),
     ("rest", REST),

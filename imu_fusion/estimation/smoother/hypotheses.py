@@ -119,15 +119,16 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
 
 
 def _other_antenna(found, model, smooth):
-    """With an antenna that is not where it is said to be, or fixes that are late, which is much the
-    same to a body that goes straight on."""
+    """With an antenna that is not where it is said to be, or fixes and velocities that are late,
+    which is much the same to a body that goes straight on."""
     sd = max(_LEVER_SD, 2.0 * float(np.linalg.norm(model.params.gnss.lever_arm)))
     for _ in range(2):
         sds = max(abs(error.sds) for error in lever_errors(found.problem))
         if sds < _SHIFTED * found.result.wander.get("fix", 1.0):
             break
         best = found, model
-        for other in (*_where_zero(model, {_LEVER: sd}), *_delays(found, model)):
+        for other in (*_where_zero(model, {_LEVER: sd}), *_delays(found, model),
+                      *_where_zero(model, {_DELAY: 0.2, _VELOCITY_DELAY: 0.2})):
             tried = _smoothed(other, smooth)
             if tried is not None and _gained(tried, found) > max(
                     _GAIN, _gained(best[0], found)):

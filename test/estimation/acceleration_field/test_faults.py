@@ -281,7 +281,8 @@ def test_ranges_are_found_and_have_a_tolerance(impact):
     at_limit = (np.abs(readings) >= limit).any(axis=(1, 2))
     # As a data sheet rounds it, above what the chip gives.
     rows, remarks, *_ = judged(impact, readings, layout(range=(78.4533,)))
-    assert np.array_equal(rows["flags"] & SATURATED > 0, at_limit) and remarks == []
+    assert np.array_equal(rows["flags"] & SATURATED > 0, at_limit)
+    assert all("leave too few channels" in text for text in remarks)
     rows, remarks, *_ = judged(impact, readings)
     found = rows["flags"] & SATURATED > 0
     assert not np.any(found & ~at_limit) and found.sum() > 0.8 * at_limit.sum()
@@ -325,6 +326,23 @@ def test_the_papers_method_says_what_it_leaves_out(impact):
     for accelerometers, said in ((layout(), True), (exact, False)):
         estimator = AccelerationFieldEstimator(PARAMS.replace(method="ao"), accelerometers)
         assert bool(estimator.remarks()) is said
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+def test_a_range_that_is_given_too_large_is_found_all_the_same(impact, mode):
+    readings = np.clip(felt(impact), -80.0, 80.0)
+    (rows, remarks, *_), (alike, *_) = (
+        judged(impact, readings, layout(**given), mode=mode) for given in ({"range": (81.0,)}, {}))
+    assert any("left: stands at its limit of 80" in text for text in remarks)
+    assert np.array_equal(rows["specific_force"], alike["specific_force"])
+
+
+def test_limits_that_leave_too_few_channels_are_said(impact):
+    readings = np.clip(felt(impact), -50.0, 50.0)
+    for limit, said in ((49.9, True), (500.0, False)):
+        sound = felt(impact) if limit > 50.0 else readings
+        remarks = judged(impact, sound, layout(range=(limit,)))[1]
+        assert any("leave too few channels" in text for text in remarks) is said
 
 
 def test_a_bias_far_beyond_its_sd_is_named(impact):

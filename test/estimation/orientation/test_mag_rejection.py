@@ -1,4 +1,4 @@
-"""Magnetometer samples at the end of the sensor's range."""
+"""Samples at the end of the magnetometer's range, and those of sensors that are stuck."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from imu_fusion.estimation.orientation.estimator import OrientationEstimator, Or
 from imu_fusion.estimation.orientation.mag_rejection import are_saturated, new_limit
 from imu_fusion.estimation.orientation.params import kernel_parameters
 from imu_fusion.estimation.orientation.rows import FLAG_MAG_SATURATED, FLAG_MAG_USED
-from imu_fusion.samples.logs import MagLog
+from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, simulate
 from test.estimation.orientation.test_estimator import errors_deg, make
 
@@ -195,3 +195,30 @@ def test_a_coarse_magnetometer_at_rest_repeats_and_is_used():
     estimator.run(imu, MagLog(mag.stamp, quantised(mag.mag, 2e-6)))
     assert estimator.summary()["mag_repeated"] == 0
     assert estimator.summary()["mag_used"] == len(mag) - 1   # not that before the first Imu
+
+
+@pytest.mark.parametrize("mode", ["causal", "smoothed"])
+def test_a_stuck_gyroscope_is_said_and_its_rates_are_not_believed(tumbling, mode):
+    imu, mag, truth = tumbling
+    half = len(imu) // 2
+    rates = imu.gyr.copy()
+    rates[half:] = rates[half]
+    estimator = make({"mode": mode})
+    rows = estimator.run(ImuLog(imu.stamp, rates, imu.acc), mag)
+    late = slice(half + 200, None)
+    sd = np.degrees(np.sqrt(np.trace(rows["cov_attitude"][late], axis1=1, axis2=2)))
+    assert (errors_deg(rows, truth)[late] < 3.0 * sd).mean() > 0.95
+    assert errors_deg(rows, truth)[late].mean() < 90.0    # any attitude: 126
+    assert any("the gyroscope repeated one value for 12 s" in text
+               for text in estimator.remarks())
+
+
+def test_constant_rates_without_noise_are_not_stuck():
+    # A turntable about an axis that leans: the force goes where the rates carry it.
+    time = np.arange(2000) * 0.01
+    turn = Rotation.from_rotvec(time[:, None] * [0.5, 0.0, 0.3])
+    force = turn.inv().apply([0.0, 0.0, 9.81])
+    estimator = make({})
+    estimator.run(ImuLog(np.round(time * 1e9).astype(np.int64),
+                         np.tile([0.5, 0.0, 0.3], (2000, 1)), force))
+    assert not any("gyroscope repeated" in text for text in estimator.remarks())
