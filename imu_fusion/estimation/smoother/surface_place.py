@@ -11,7 +11,7 @@ import numpy as np
 from imu_fusion.surfaces.constraint import Constraint
 
 _LOSS = 6.0       # standard deviations at which a fix lets go, as in the smoother
-_CHANCE = 1.0      # standard deviations of an offset: one in three by chance; more hid a metre
+_CHANCE = 1.645   # standard deviations of an offset: one in ten by chance
 
 
 def fixes_beside(residuals: np.ndarray, wander: float) -> tuple[np.ndarray, float]:
@@ -26,7 +26,7 @@ def widen_place(samples: np.ndarray, constraints: Sequence[Constraint], factor: 
                 offset: np.ndarray, offset_sd: np.ndarray) -> None:
     """Add the error that is common to all rows of a surface to the covariances of positions: its
     sigma in height, unless fixes know the height better; and the offset of the fixes from it, where
-    that is more than its standard deviation.
+    that is hardly chance.
 
     Args:
         samples: of a SmootherResult, in place. constraints: of the surface. factor: of its
