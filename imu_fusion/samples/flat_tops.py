@@ -177,7 +177,7 @@ def _judge_run(found, i, edge, floor):
     found.counted[i] = 1
     if (found.limit[i] == math.inf and found.level[i] > 0.0
             and abs(level - found.level[i]) < BAND * level):
-        found.limit[i] = max(level, found.level[i])
+        found.limit[i] = 0.5 * (level + found.level[i])
         found.tolerance[i] = _SPREAD
     found.level[i] = level
 
