@@ -36,7 +36,8 @@ _LARGE = 1.5         # standard deviations, of typical innovations of the receiv
 _FEWEST = 20         # readings of a kind, of which a typical size is no chance
 _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
 _LEVER = "gnss.lever_arm_sd"
-_SHIFTED = 3.0       # standard deviations of an error of antenna or clock, which is tried
+_SHIFTED = 3.0       # standard deviations of an error of the antenna, which is tried
+_DRIFTS = 12.0       # and of the clock: velocities of a real receiver, whose lag varies, get to 6
 _LEVER_SD = 1.0      # m, or twice as far as the antenna is said to be: what a wrong sign makes
 _CLOCK_TRIES = 4     # a trajectory that is bent by a clock tells a part of what it is off by
 _LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
@@ -144,7 +145,7 @@ def _other_clock(found, model, smooth):
     for _ in range(_CLOCK_TRIES):
         error, known = clock_error(found.problem), model.clock_rate != 0.0
         if abs(error.sds) < (1.0 if known else
-                             _SHIFTED * found.result.wander.get("fix", 1.0)):
+                             _DRIFTS * found.result.wander.get("fix", 1.0)):
             break
         other = model._replace(clock_rate=model.clock_rate + error.size)
         best = found, model
