@@ -62,9 +62,11 @@ class RangeLimits:
             _mark(self.beside, self.steps, self._unknown, self._accelerometers,
                   others.reshape(len(readings), -1, 3))
             marked[np.isposinf(others)] = np.inf
-        felt = marked[:, self._felt]
-        self.bare += (np.sum(np.isposinf(felt).any(axis=1)
-                             & (np.isfinite(felt).sum(axis=1) <= _NEEDED)), len(felt))
+        self.bare[1] += len(marked)
+        if np.isposinf(marked).any():    # of live samples hardly one
+            felt = marked[:, self._felt]
+            self.bare[0] += np.sum(np.isposinf(felt).any(axis=1)
+                                   & (np.isfinite(felt).sum(axis=1) <= _NEEDED))
         return marked
 
     @property
