@@ -96,7 +96,7 @@ def rows():
         ("The same, gyroscopes cut off at 300 deg/s (24.3 % of the samples): RMS, deg",
          f"{_clipped('fusion, causal')} live, {_clipped('fusion, smoothed')} smoothed",
          f"OfflineVQF {_clipped('OfflineVQF')}", "orientation_clipping"),
-        *((f"The same defaults on {what}: RMS, deg",
+        *((f"The same defaults, chosen with a look at this set, too, on {what}: RMS, deg",
            f"{_set(name, 'causal')} live, {_set(name, 'smoothed')} smoothed",
            "VQF {}, OfflineVQF {}".format(*(
                _set(name, mode, "peer: total / inclination / heading, deg")

@@ -29,7 +29,7 @@ WINDOW_BYTES = 16e6
 QUEUED_BYTES = 64e6  # of one topic, acknowledged but not taken
 
 SETTLING = 1.0  # s without anybody new, after which all who are there are taken to be known
-MATCHING = 5.0  # s without anybody new, after which readers that are not ours keep nobody waiting
+MATCHING = 5.0  # s, for which readers that are not matched are waited for once all have answered
 
 _LIVE, _JOINING, _OPEN, _ENDED = range(4)
 
@@ -145,6 +145,7 @@ class Source:
         self._session = ""
         self._awaited: set[str] = set()  # of those names, not yet here in this session
         self._version = 0  # of the company
+        self._answered_at = float("inf")  # when all of it had answered
         self._takers: dict[str, tuple[str, Joined]] = {}  # instance -> name, what it said last
         self._event = ""  # with which the session is to end
         self._begin_after = False
@@ -245,6 +246,7 @@ class Source:
             if anew or known - self.company:
                 self.company |= known
                 self._version += 1
+                self._answered_at = float("inf")
                 self.phase = _JOINING
                 self.peers.say()
         else:
@@ -332,6 +334,7 @@ class Source:
         if (self._waiting() or self._awaited
                 or any(peer.is_silent for peer in self.peers.values()) or self._is_settling()):
             return False
+        self._answered_at = min(self._answered_at, time.monotonic())
         for topic, output in self.outputs.items():
             infos = self.node.get_subscriptions_info_by_topic(topic)
             ours = {j.topics[topic].reader for j in self._answers().values()
@@ -342,13 +345,15 @@ class Source:
                 i.topic_type == type_name(output.msg_type)
                 and qos_check_compatible(output.qos, i.qos_profile)[0] != QoSCompatibility.ERROR
                 for i in infos)
-            if output.matched() < compatible and self._is_settling(MATCHING):
+            # One that is not ours may stay so: in another partition, say.
+            if (output.matched() < compatible
+                    and time.monotonic() - self._answered_at < MATCHING):
                 return False
         return True
 
-    def _is_settling(self, within=SETTLING):
+    def _is_settling(self):
         """Whether somebody may be there who is not known yet."""
-        return time.monotonic() - self._news_at < within
+        return time.monotonic() - self._news_at < SETTLING
 
     def _look_around(self):
         """Find out who subscribes and is not, or not yet, known as one of ours."""
