@@ -50,7 +50,7 @@ SENSOR: dict[str, dict[str, Any]] = {
     "acc_range": dict(
         unit="m/s^2", low=1e-3, length=(1, 3),
         doc="Largest specific force that the accelerometer reports, one value or one per axis; "
-            "unset: taken as never reached."),
+            "unset: found from the data where the estimator can, else taken as never reached."),
     "acc_position_sd": dict(
         unit="m", low=0.0, high=0.1,
         doc="Standard deviation of an accelerometer's place, each coordinate, as states; 0: known "
