@@ -127,13 +127,9 @@ def _other_antenna(found, model, smooth):
         sds = max(abs(error.sds) for error in lever_errors(found.problem))
         if sds < _SHIFTED * found.result.wander.get("fix", 1.0):
             break
-        best = found, model
-        for other in (*_where_zero(model, {_LEVER: sd}), *_delays(found, model),
-                      *_where_zero(model, {_DELAY: 0.2, _VELOCITY_DELAY: 0.2})):
-            tried = _smoothed(other, smooth)
-            if tried is not None and _gained(tried, found) > max(
-                    _GAIN, _gained(best[0], found)):
-                best = tried, other
+        others = (*_where_zero(model, {_LEVER: sd}), *_delays(found, model),
+                  *_where_zero(model, {_DELAY: 0.2, _VELOCITY_DELAY: 0.2}))
+        best = _likeliest(found, model, others, smooth)
         if best[0] is found:
             break
         found, model = best
@@ -148,9 +144,8 @@ def _other_clock(found, model, smooth):
                              _DRIFTS * found.result.wander.get("fix", 1.0)):
             break
         other = model._replace(clock_rate=model.clock_rate + error.size)
-        best = found, model
-        for tried in (other, *_delays(found, other)):
-            best = _try(*best, tried, smooth, 0.0 if known else _GAIN)
+        best = _likeliest(found, model, (other, *_delays(found, other)), smooth,
+                          0.0 if known else _GAIN)
         if best[0] is found:
             break
         found, model = best
@@ -267,14 +262,10 @@ def _other_time(found, model, smooth):
         # Recovered rates are of no single time.
         if not lag or found.problem.imu.log.gyr_sd is not None:
             break
-        best = found, model
-        for name, more in (("mag", lag), ("gyr", -lag)):
-            if model.late and name not in model.late:
-                continue
-            other = model._replace(late={name: model.late.get(name, 0.0) + more})
-            tried = _smoothed(other, smooth)
-            if tried is not None and _gained(tried, best[0]) > 0.0:
-                best = tried, other
+        others = [model._replace(late={name: model.late.get(name, 0.0) + more})
+                  for name, more in (("mag", lag), ("gyr", -lag))
+                  if not model.late or name in model.late]
+        best = _likeliest(found, model, others, smooth, 0.0)
         if best[0] is found:
             break
         found, model = best
@@ -390,10 +381,18 @@ def _where_zero(model, changes):
 
 def _try(found, model, other, smooth, gain=_GAIN):
     """The attempt and model that are likelier by a gain, else those found."""
-    tried = _smoothed(other, smooth)
-    if tried is None:
-        return found, model
-    return (tried, other) if _gained(tried, found) > gain else (found, model)
+    return _likeliest(found, model, (other,), smooth, gain)
+
+
+def _likeliest(found, model, others, smooth, gain=_GAIN):
+    """The likeliest of attempts under other models, and its model, if it is by a gain; else those
+    found."""
+    best = found, model
+    for other in others:
+        tried = _smoothed(other, smooth)
+        if tried is not None and (gained := _gained(tried, found)) > gain:
+            best, gain = (tried, other), gained
+    return best
 
 
 def _smoothed(other, smooth):
