@@ -22,11 +22,14 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.problem import log_density
 from imu_fusion.estimation.smoother.profile_fit import profile_error, widened_by_profile
-from imu_fusion.estimation.smoother.receiver_fit import clock_error, lever_errors
+from imu_fusion.estimation.smoother.receiver_fit import (
+    clock_error,
+    delay_of_fixes,
+    lever_errors,
+)
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.sensor_lag import field_lag
-from imu_fusion.estimation.smoother.state import VEL
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
 from imu_fusion.estimation.smoother.whiteness import correlation, wandering
 
@@ -41,7 +44,6 @@ _DRIFTS = 12.0       # and of the clock: velocities of a real receiver, whose la
 _LEVER_SD = 1.0      # m, or twice as far as the antenna is said to be: what a wrong sign makes
 _CLOCK_TRIES = 4     # a trajectory that is bent by a clock tells a part of what it is off by
 _LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
-_STEP_OF_DELAY = 0.1   # s, for which its likelihood is taken
 _PERHAPS = 1.0       # standard deviation of a delay that is tried: far from it they err
 _LAG_TRIES = 3       # what turns to and fro within a lag tells only a part of it
 _FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
@@ -156,18 +158,9 @@ def _late_fixes(found, model, smooth):
     """With fixes alone that are late: a smooth path hardly contradicts seconds of that. Those of
     its ends alone would be free of either."""
     for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
-        if abs(_lateness(found)) > _PERHAPS:
+        if abs(delay_of_fixes(found.problem).sds) > _PERHAPS:
             found, model = _try(found, model, other, smooth)
     return found, model
-
-
-def _lateness(found):
-    """Standard deviations by which the delay of the fixes seems not to be zero."""
-    problem = found.problem
-    sample = np.repeat(np.arange(len(problem.x)), np.diff(problem.reading_start))
-    of_fix = np.isin(problem.readings["kind"], (FIX, MOVED_FIX))
-    ahead = np.where(of_fix[:, None], problem.x[sample, VEL:VEL + 3], 0.0)
-    return problem.shift(_STEP_OF_DELAY, readings=ahead)[1]
 
 
 def _adapted(found, model, given):
