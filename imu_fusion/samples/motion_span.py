@@ -19,6 +19,10 @@ _SHORTEST = 0.5      # s, of a rest
 # the sensors of the paper passes, and less than a body in motion shows.
 _QUIET_RATE = 0.15   # rad/s
 _QUIET_FORCE = 3.0   # m/s^2
+# Free flight and steady sliding are quiet, too. At rest the force is gravity but for what an
+# accelerometer errs by before it is calibrated, and the rate is a gyroscope's bias.
+_FORCE_OFF = 1.5     # m/s^2
+_RATE_OFF = 0.2      # rad/s
 # The ball moves where the mean of a few samples deviates from the rest by more than this.
 _ONSET_SDS = 5.5
 _ONSET_FORCE = 0.15  # m/s^2, and at least by that
@@ -61,7 +65,9 @@ def find_motion(imu: ImuLog) -> MotionSpan:
         low = scipy.ndimage.minimum_filter1d(values, width, axis=0, mode="nearest")
         still &= (high - low).max(axis=1) < limit
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    rests = [(a, b) for a, b in edges.reshape(-1, 2) if (b - a) * step >= _SHORTEST]
+    rests = [(a, b) for a, b in edges.reshape(-1, 2) if (b - a) * step >= _SHORTEST
+             and abs(np.linalg.norm(imu.acc[a:b].mean(axis=0)) - _STANDARD_GRAVITY) < _FORCE_OFF
+             and np.linalg.norm(imu.gyr[a:b].mean(axis=0)) < _RATE_OFF]
     if not rests:
         raise EstimationError(f"no rest of {_SHORTEST} s in the recording: the ball's first "
                               "attitude is not known; begin the recording before it moves")

@@ -31,3 +31,22 @@ def test_a_spin_ends_where_it_is_down_to_the_level_of_rest(kind, rate):
     assert time[motion.stop] == pytest.approx(STOP, abs=0.05)
     # What it rested at before is of the rest before.
     assert time[motion.rest_start] < 5.0 and np.abs(motion.gyr_bias - 0.01).max() < 2e-3
+
+
+@pytest.mark.parametrize("quiet", [([0.0, 0.0, 2.9], 0.0), ([0.0, 0.0, 9.8], 1.5)],
+                         ids=["flight", "steady spin"])
+def test_what_is_quiet_in_mid_ride_is_no_rest(quiet):
+    """In flight it feels its spin alone; a spin about the vertical leaves gravity as it is."""
+    force, rate = quiet
+    rng = np.random.default_rng(4)
+    time = np.arange(0.0, 30.0, 0.01)
+    moving, flies = (time > 5.0) & (time < 20.0), (time > 11.0) & (time < 12.0)
+    shaken = moving & ~flies
+    gyr = 0.005 * rng.standard_normal((len(time), 3)) + np.outer(shaken, [3.0, 0.0, 0.0])
+    gyr[flies, 2] += rate
+    acc = [0.0, 0.0, 9.8] + (0.1 + 4.0 * shaken[:, None]) * rng.standard_normal((len(time), 3))
+    acc[flies] += force - np.array([0.0, 0.0, 9.8])
+    motion = find_motion(ImuLog((time * 1e9).astype(np.int64), gyr, acc))
+    assert time[motion.start] == pytest.approx(5.0, abs=0.05)
+    assert time[motion.stop] == pytest.approx(20.0, abs=0.05)
+    assert motion.begins_recording
