@@ -50,7 +50,7 @@ REST = np.dtype([
     ("settled_force", "f8", 3),          # mean_force at that stamp
     ("settled_rate", "f8", 3),           # mean_rate, likewise
     ("turn", "f8", 3),                   # rad, that the rates less their bias make since then
-    ("refuting", "i8", MOST_REFUTING),   # ``settled`` of rests that refuted a bias; 0: no more
+    ("refuting", "i8", MOST_REFUTING),   # ``changed`` of rests that refuted a bias; 0: no more
 ], align=True)
 """The rest detector (rest_detection)."""
 
