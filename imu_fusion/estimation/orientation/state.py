@@ -188,6 +188,7 @@ STATE = np.dtype([
     ("position_likelihood", "f8"),       # of positions, likewise
     ("is_anchored", "?"),                # whether the heading is that of the first needle
     ("anchor", "f8", 12),                # rad, of that per hard (3) and soft iron (9)
+    ("first_tilt_var", "f8"),            # rad^2, of what the first tilt turned that needle by
     ("field_scatter", "f8"),             # mean square per axis about ``field`` while moving
     ("scattered", "i8"),                 # blocks that it is the mean of
     ("heading_var", "f8"),               # rad^2, of a heading that no filter can improve on

@@ -25,6 +25,7 @@ from imu_fusion.estimation.smoother.profile_fit import profile_error, widened_by
 from imu_fusion.estimation.smoother.receiver_fit import (
     clock_error,
     delay_of_fixes,
+    height_error,
     lever_errors,
 )
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
@@ -41,6 +42,7 @@ _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
 _LEVER = "gnss.lever_arm_sd"
 _SHIFTED = 3.0       # standard deviations of an error of the antenna, which is tried
 _DRIFTS = 12.0       # and of the clock: velocities of a real receiver, whose lag varies, get to 6
+_SCALED, _MUCH = 10.0, 0.2   # standard deviations of a scale of heights, and the least of it
 _LEVER_SD = 1.0      # m, or twice as far as the antenna is said to be: what a wrong sign makes
 _CLOCK_TRIES = 4     # a trajectory that is bent by a clock tells a part of what it is off by
 _LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
@@ -100,6 +102,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     if (model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations
             and len(found.result.innovations.get("fix", ((),))[0]) >= _FEWEST):
         found, model = _late_fixes(found, model, smooth)
+        found, model = _other_clock(found, model, smooth)
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
             or _many_outliers(found.result)):
@@ -163,9 +166,20 @@ def _late_fixes(found, model, smooth):
     return found, model
 
 
+def _scale_of_heights(found):
+    """How many times as much as the body heights of fixes alone surely change; else 1. Velocities
+    would contradict them."""
+    if "velocity" in found.result.innovations:
+        return 1.0
+    error = height_error(found.problem)
+    sure = abs(error.sds) > _SCALED * found.result.wander.get("fix", 1.0)
+    return 1.0 + error.size if sure and abs(error.size) > _MUCH else 1.0
+
+
 def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), stands=model.stands,
+                   height_scale=_scale_of_heights(found),
                    profile=model.profile, late=dict(model.late), clock_rate=model.clock_rate,
                    centre=other_centre(found.problem),
                    clipped_forces=clipped_forces(found.problem), adapted={

@@ -1,4 +1,5 @@
-"""Whether fixes and velocities show an antenna that is elsewhere, or a clock that runs otherwise.
+"""Whether fixes and velocities show an antenna that is elsewhere, a clock that runs otherwise, or
+heights in another unit.
 
 A smooth trajectory takes such errors along and leaves innovations that look white. How the cost
 changes with a shift of the readings is what is left of them, times the shift: exactly, as the
@@ -13,7 +14,7 @@ import scipy  # its parts are loaded where they are first used
 
 from imu_fusion.estimation.smoother.measurements.registry import FIX, MOVED_FIX, VELOCITY
 from imu_fusion.estimation.smoother.problem import Problem
-from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, VEL, slow_states
+from imu_fusion.estimation.smoother.state import ATT, GYR_BIAS, POS, VEL, slow_states
 
 _PERHAPS = 1.0     # standard deviations, all that is left taken together: less is no question
 _FEWEST = 20       # readings
@@ -41,6 +42,12 @@ def clock_error(problem: Problem) -> Shift:
     return _shifts(problem, [_Motion(problem).of_clock()])[0]
 
 
+def height_error(problem: Problem) -> Shift:
+    """By how much (1: twice as much) heights of the fixes change more than those of the body, which
+    goes along with them."""
+    return _shifts(problem, [_Motion(problem).of_heights()], perhaps=0.0)[0]
+
+
 def delay_of_fixes(problem: Problem) -> Shift:
     """Seconds by which fixes are late; a smooth path takes nearly all of it along."""
     return _shifts(problem, [_Motion(problem).of_delay()], perhaps=0.0)[0]
@@ -56,6 +63,7 @@ class _Motion:
         self.place = np.isin(kind, (FIX, MOVED_FIX))[:, None]
         self.speed = (kind == VELOCITY)[:, None]
         self.since = (log.stamp[sample] - log.stamp.mean()) * 1e-9
+        self.height = x[sample, POS + 2]
         self.velocity = x[sample, VEL:VEL + 3]
         time = (log.stamp - log.stamp[0]) * 1e-9
         self.acceleration = np.gradient(x[:, VEL:VEL + 3], time, axis=0)[sample]
@@ -66,6 +74,10 @@ class _Motion:
         """What readings (M, 3) change by, if the antenna is a lever (3,) m away."""
         return (self.place * self.attitude.apply(lever)
                 + self.speed * self.attitude.apply(np.cross(self.rate, lever)))
+
+    def of_heights(self):
+        """What they change by, if heights count twice, from their mean on."""
+        return self.place * (self.height - self.height.mean())[:, None] * [0.0, 0.0, 1.0]
 
     def of_delay(self):
         """What they change by, if fixes are a second late."""
