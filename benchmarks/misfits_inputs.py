@@ -17,7 +17,7 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 AK8963 = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-def input_row(situation, before, spoil, with_mag=True, travel_sd=0.2) -> Scenario:
+def input_row(situation, before, spoil, with_mag=True, travel_sd=0.2, **params) -> Scenario:
     """Scenario of logs that spoil(imu, mag, rng) -> (imu, mag) has spoilt."""
     def run(seed):
         imu, mag, truth, _ = simulate(
@@ -26,7 +26,8 @@ def input_row(situation, before, spoil, with_mag=True, travel_sd=0.2) -> Scenari
         imu, mag = spoil(imu, mag if with_mag else mag[:0], np.random.default_rng(seed))
         logs = {IMU_TOPIC: imu} | ({MAG_TOPIC: mag} if with_mag else {})
         found = findings(logs)
-        rows = OrientationEstimator(OrientationParams(declination_deg=0.0)).run(imu, mag)
+        rows = OrientationEstimator(
+            OrientationParams(declination_deg=0.0).replace(**params)).run(imu, mag)
         # By number: stamps may be what is wrong.
         stamps = imu.stamp if len(imu) == len(truth) else truth.stamp
         at = np.searchsorted(stamps, rows["stamp"])
@@ -85,6 +86,14 @@ def one_wild_force(imu, mag, rng):
     return with_imu(imu, acc=acc), mag
 
 
+def constant(imu, mag, rng):
+    return with_imu(imu, acc=imu.acc + [1.0, 0.0, 0.0]), mag
+
+
+def feels(imu, mag, rng):
+    return with_imu(imu, imu.gyr + 0.01 * imu.acc), mag
+
+
 def frames(seed):
     found = check_frames({"imu_left": None, "imu_right": None}, IMU_TOPIC)
     return Outcome(said=[f.text for f in found], refused=any(f.unusable for f in found))
@@ -116,10 +125,12 @@ INPUT_ROWS = [
               lambda imu, mag, rng: (imu, MagLog(mag.stamp, mag.mag @ QUARTER.T))),
     input_row("magnetometer reversed", "",
               lambda imu, mag, rng: (imu, MagLog(mag.stamp, -mag.mag))),
-    input_row("an axis of the accelerometer off by 1 m/s^2", "",
-              lambda imu, mag, rng: (with_imu(imu, acc=imu.acc + [1.0, 0.0, 0.0]), mag)),
-    input_row("gyroscope feels accelerations, 0.01 rad/s per m/s^2", "",
-              lambda imu, mag, rng: (with_imu(imu, imu.gyr + 0.01 * imu.acc), mag)),
+    input_row("an axis of the accelerometer off by 1 m/s^2", "", constant),
+    input_row("the same, sensor.acc_bias_sd as the remark says", "", constant,
+              **{"sensor.acc_bias_sd": 1.0}),
+    input_row("gyroscope feels accelerations, 0.01 rad/s per m/s^2", "", feels),
+    input_row("the same, sensor.gyro_bias_walk and gyro_bias_sd as the remark says", "", feels,
+              **{"sensor.gyro_bias_walk": 0.1, "sensor.gyro_bias_sd": 0.1}),
     input_row("magnetometer in the axes of an AK8963", "34 deg",
               lambda imu, mag, rng: (imu, MagLog(mag.stamp, mag.mag @ AK8963.T))),
     input_row("magnetometer constant while turning", "silent",

@@ -117,8 +117,16 @@ class Node(rclpy.node.Node):
                          **kwargs)
         self.finished = False
         self.problems: list[str] = []  # texts: why the exit code is INCOMPLETE
-        self._params = self._declare(params_files)
-        self.add_on_set_parameters_callback(self._on_set_parameters)
+        try:
+            self._params = self._declare(params_files)
+            self.add_on_set_parameters_callback(self._on_set_parameters)
+            self.set_up()
+        except BaseException:
+            self.destroy_node()  # else others see it until its memory is freed
+            raise
+
+    def set_up(self) -> None:
+        """What the node does before it runs; if it raises, nothing of it stays in the graph."""
 
     def params(self, cls: type[P]) -> P:
         """The present values of one of the node's PARAMETERS dataclasses."""

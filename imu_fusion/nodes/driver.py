@@ -68,8 +68,7 @@ class Driver(Node):
     NAME = "driver"
     PARAMETERS = (DriverParams,)
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
+    def set_up(self):
         p = self._p = self.params(DriverParams)
         if not p.transport:
             raise ParameterError("parameter 'transport' of node driver: no address given; add -p "

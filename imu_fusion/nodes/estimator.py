@@ -22,8 +22,7 @@ class EstimatorNode(Node):
 
     TASK = "samples"
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
+    def set_up(self):
         self._announcing = ExitStack()
         self._announcing.enter_context(announced_compiling(self.get_logger().info))
         self._stopping = False

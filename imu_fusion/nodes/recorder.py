@@ -70,8 +70,7 @@ class Recorder(Node):
     NAME = "recorder"
     PARAMETERS = (RecorderParams,)
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
+    def set_up(self):
         p = self._p = self.params(RecorderParams)
         if not p.out:
             raise ParameterError("parameter 'out' of node recorder: no directory given; "

@@ -65,8 +65,7 @@ class Replayer(Node):
     NAME = "replayer"
     PARAMETERS = (ReplayerParams,)
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
+    def set_up(self):
         p = self.params(ReplayerParams)
         if not p.bag:
             raise ParameterError("parameter 'bag' of node replayer: no recording given; "

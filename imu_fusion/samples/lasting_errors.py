@@ -38,6 +38,7 @@ _WILD = 20.0            # times what all but a hundredth of the samples are off 
 _CLIPPED = 0.999        # of a limit
 _LATE = 0.02            # s: less is a matter of filters
 _FEELS = 5e-3           # rad/s per m/s^2 (3 deg/s per g): fifteen times what gyroscopes feel
+_GRAVITY = 9.81         # m/s^2, turned over within a second: what its bias then changes by
 _CALM = 2e-3            # of it, sd: where the field is as disturbed as that it tells nothing
 # Where a body hardly tumbles, a constant is part of what stands still. How much of its column no
 # other explains, in its mean square: along an axis that is judged, along the others, for the field.
@@ -89,8 +90,8 @@ def check_force_errors(imu: ImuLog, name: str) -> list[Finding]:
         result.append(Finding(
             "unit", f"{name}: while it turns the accelerometer reads some ({values}) m/s^2 more "
             "than gravity and accelerations make: calibrate it (imu_fusion calibrate "
-            "accelerometer), or raise sensor.acc_bias_sd; until then tilts are off by as much as "
-            "that is of gravity"))
+            f"accelerometer), or set sensor.acc_bias_sd to {np.abs(constant).max():.1f} or more; "
+            "until then tilts are off by as much as that is of gravity"))
     late = found.value["delay"]
     if _is_sure(late, found.sd["delay"], _LATE).any():
         result.append(late_finding(float(late[0]), "gravity", name))
@@ -117,7 +118,8 @@ def check_field_errors(imu: ImuLog, mag: MagLog, name: str) -> list[Finding]:
     return [Finding(
         "axes", f"{name}: the field turns as if the gyroscope felt forces, by up to {most:.1f} "
         "mrad/s per m/s^2: its bias changes with how it lies and moves; mount it softly, take "
-        "another one, or raise sensor.gyro_bias_walk and sensor.gyro_bias_sd")]
+        "another one, or set sensor.gyro_bias_walk and sensor.gyro_bias_sd to "
+        f"{_GRAVITY * 1e-3 * abs(most):.2g}")]
 
 
 def _is_sure(value, sd, least):
@@ -147,6 +149,7 @@ def _stretches(imu, vectors, length):
     whole = np.abs(steps.sum(axis=1) * 1e-9 / interval - (size * group - 1)) < 0.05 * size * group
     for values in (rates, forces, vectors):
         whole &= np.isfinite(values).all(axis=(1, 2))
+    whole &= vectors.any(axis=(1, 2))    # zeros: there is no such sensor
     path = np.where(whole, np.linalg.norm(rates, axis=2).sum(axis=1), 0.0)
     best = np.argsort(-path, kind="stable")[:max(int(_MOST / (size * group * interval)), 1)]
     best = best[path[best] * group * interval > _TURNS]

@@ -11,6 +11,7 @@ from std_srvs.srv import Trigger
 
 from imu_fusion.errors import BagError, ParameterError, TopicError
 from imu_fusion.nodes.flow import END, NEXT
+from imu_fusion.nodes.flow.state import MARK
 from imu_fusion.nodes.orientation_estimator import OrientationEstimatorNode
 from imu_fusion.nodes.replayer import Replayer
 from imu_fusion.recordings.bag_reader import open_bag
@@ -221,10 +222,14 @@ def test_types_that_are_not_installed_are_left_out_with_a_warning(graph, tmp_pat
         for i in range(3):
             writer.write("/x", "nowhere_msgs/msg/Thing", b"\0\1\0\0\1\0\0\0", START + i,
                          definition=definition)
+    looker = graph.node("looker")
     with pytest.raises(TopicError, match="nowhere_msgs/msg/Thing is not installed"):
         graph.start(Replayer, bag=str(tmp_path / "b"), topics=["/x"])
-    with pytest.raises(TopicError, match="nothing to play"):
+    with pytest.raises(TopicError, match="nothing to play") as refused:
         graph.start(Replayer, bag=str(tmp_path / "b"))
+    # Nothing of it stays in the graph, even while the error holds on to the node.
+    assert refused.tb and looker.get_node_names() == ["looker"]
+    assert not any(MARK in topic for topic, _ in looker.get_topic_names_and_types())
 
 
 @pytest.mark.parametrize("parameters, error, text", [

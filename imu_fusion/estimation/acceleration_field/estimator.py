@@ -240,11 +240,12 @@ class AccelerationFieldEstimator:
         if self.params.use_gyro:
             gyr = np.full((len(stamp), 3), np.nan) if gyr is None else np.asarray(gyr, dtype=float)
             flat = np.hstack([flat, gyr.reshape(len(stamp), 3)])
-        before = np.append(stamp[:1] - 1 if self._last is None else self._last, stamp[:-1])
-        bad = np.flatnonzero(stamp <= before[:len(stamp)])
-        if len(bad):
-            raise SampleError(f"acceleration field: stamp {stamp[bad[0]]} ns is not later "
-                              f"than {before[bad[0]]} ns before it; sort and merge the samples")
+        late = len(stamp) > 0 and self._last is not None and stamp[0] <= self._last
+        if late or (len(stamp) > 1 and (stamp[1:] <= stamp[:-1]).any()):
+            before = np.append(stamp[:1] - 1 if self._last is None else self._last, stamp[:-1])
+            bad = np.argmax(stamp <= before)
+            raise SampleError(f"acceleration field: stamp {stamp[bad]} ns is not later "
+                              f"than {before[bad]} ns before it; sort and merge the samples")
         return stamp, flat
 
     def _channels(self, flat):

@@ -30,6 +30,7 @@ class RangeLimits:
         self._ranges = np.full((number, 3), np.nan)
         channels = array.channels[np.isfinite(array.channels["range"])]
         self._ranges.reshape(-1)[channels["column"]] = channels["range"]
+        self._is_given = bool(len(channels))
         self._accelerometers = array.accelerometers
         self._felt = array.channels["column"][~array.channels["is_gyro"]]
         self._unknown = np.full((number, 3), np.nan)
@@ -55,15 +56,15 @@ class RangeLimits:
         in a row is left out even before: no noise is so quiet, and the others fill in.
         """
         marked = readings.copy()
-        _mark(self.found, self.steps, self._ranges, self._accelerometers,
-              marked.reshape(len(readings), -1, 3))
-        if np.isfinite(self._ranges).any():
+        number = _mark(self.found, self.steps, self._ranges, self._accelerometers,
+                       marked.reshape(len(readings), -1, 3))
+        if self._is_given:
             others = readings.copy()
-            _mark(self.beside, self.steps, self._unknown, self._accelerometers,
-                  others.reshape(len(readings), -1, 3))
+            number += _mark(self.beside, self.steps, self._unknown, self._accelerometers,
+                            others.reshape(len(readings), -1, 3))
             marked[np.isposinf(others)] = np.inf
         self.bare[1] += len(marked)
-        if np.isposinf(marked).any():    # of live samples hardly one
+        if number:
             felt = marked[:, self._felt]
             self.bare[0] += np.sum(np.isposinf(felt).any(axis=1)
                                    & (np.isfinite(felt).sum(axis=1) <= _NEEDED))
@@ -85,12 +86,15 @@ def _start(found, ranges):
 
 @njit
 def _mark(found, steps, ranges, accelerometers, readings):
-    """Set what is at a limit to inf, in place: readings (n, K, 3), gyroscopes last."""
-    sample, last = np.empty(3), np.empty(3)
+    """Set what is at a limit to inf, in place: readings (n, K, 3), gyroscopes last. Returns how
+    many are inf."""
+    sample, last, number = np.empty(3), np.empty(3), 0
     for n in range(len(readings)):
         for k in range(len(found)):
             felt = k < accelerometers
             floor = ACC_FLOOR if felt else GYRO_FLOOR
+            for i in range(3):
+                number += readings[n, k, i] == np.inf
             if not np.isfinite(readings[n, k]).any():
                 continue    # lost: what comes next would seem to have jumped
             for i in range(3):
@@ -106,3 +110,5 @@ def _mark(found, steps, ranges, accelerometers, readings):
                           and size >= found[k].largest[i])
                 if np.isfinite(readings[n, k, i]) and (clipped >> i & 1 or stands):
                     readings[n, k, i] = np.inf
+                    number += 1
+    return number

@@ -66,7 +66,6 @@ from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize
 from imu_fusion.kernels import njit
 
 
-@njit
 def _make_step():
     return Step(np.full(1, -1.0), np.empty((4, 4)), np.empty((4, 4)))
 
@@ -79,7 +78,9 @@ def _predict_to(stamp, state, p, channels, step, trace, n):
     """
     trace.dt[n] = 0.0
     flags = 0
-    if state.last[0] >= 0:
+    if state.last[0] < 0:
+        step.dt[0] = -1.0
+    else:
         dt = (stamp - state.last[0]) * 1e-9
         if dt > p.gap.max:
             flags = GAP
@@ -139,14 +140,14 @@ def _correct(state, p, channels, reading, at, is_predicted, is_causal, step, wor
 
 
 @njit
-def filter_samples(state, par, channels, stamp, readings, rows, trace, work, exact):
+def filter_samples(state, par, channels, stamp, readings, rows, step, trace, work, exact):
     """Filter n samples in order, in place; one of ``rows`` (n,) ROW each.
 
     par: (1,) record of :func:`kernel_params`, channels: (m,) CHANNEL, stamp: (n,) int64 ns,
-    readings: (n, m), trace: a Trace of one sample and work: a Workspace, to work in; exact: Exact.
+    readings: (n, m), step: the last Step, trace: a Trace of one sample and work: a Workspace, to
+    work in; exact: Exact.
     """
     p = par[0]
-    step = _make_step()
     at = np.empty_like(state.x)
     # Literals would compile what is called once more.
     only, yes = np.int64(0), np.bool_(True)
@@ -189,14 +190,13 @@ def _put(row, p, channels, state, exact):
 
 
 @njit
-def trace_samples(state, par, channels, stamp, readings, at, trace, work):
+def trace_samples(state, par, channels, stamp, readings, at, step, trace, work):
     """As :func:`filter_samples`, but for the smoother: keeps a Trace of all n samples.
 
     at: (n, N) states to linearise at, or (0, N): at each prediction. Returns the log likelihood of
     the readings.
     """
     p = par[0]
-    step = _make_step()
     where = np.empty_like(state.x)
     likelihood, no = 0.0, np.bool_(False)
     for n in range(len(stamp)):
@@ -224,6 +224,7 @@ class RigidBodyFilter:
         self._par["is_adaptive"] = is_adaptive
         self._channels = array.channels
         self._one = make_trace(1, len(array.channels), len(start.x))
+        self._step = _make_step()
         self._work = make_workspace(array.channels)
         linearise(array.channels, start.x, self._work)
         self.state = _first_state(start, array)
@@ -247,8 +248,8 @@ class RigidBodyFilter:
     def process(self, stamp: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Rows (n,) ROW of samples: stamp (n,), readings (n, m)."""
         rows = np.empty(len(stamp), ROW)
-        filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._one,
-                       self._work, self._exact)
+        filter_samples(self.state, self._par, self._channels, stamp, readings, rows, self._step,
+                       self._one, self._work, self._exact)
         return rows
 
     @property
@@ -260,8 +261,8 @@ class RigidBodyFilter:
     def trace(self, stamp: np.ndarray, readings: np.ndarray, at: np.ndarray,
               trace: Trace) -> float:
         """:func:`trace_samples` with this filter's memory."""
-        return trace_samples(self.state, self._par, self._channels, stamp, readings, at, trace,
-                             self._work)
+        return trace_samples(self.state, self._par, self._channels, stamp, readings, at, self._step,
+                             trace, self._work)
 
 
 def copied(state: State) -> State:

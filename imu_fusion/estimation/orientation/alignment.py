@@ -16,6 +16,7 @@ from imu_fusion.estimation.orientation.mag_rejection import (
     is_mag_sample,
     new_limit,
 )
+from imu_fusion.estimation.orientation.mag_repeats import REPEATS, is_stale
 from imu_fusion.estimation.orientation.params import OrientationParams
 from imu_fusion.geometry.rotation import quat_exp, quat_from_matrix, quat_multiply, quat_rotate
 from imu_fusion.kernels import njit
@@ -146,6 +147,16 @@ def _rotate_all(chain, vectors):
     return out
 
 
+@njit
+def _fresh(chain, mag, noise_sd):
+    """Mask (m,) of samples (m, 3) at attitudes (m, 4) that do not repeat an old one."""
+    kept = np.zeros(1, REPEATS)
+    fresh = np.empty(len(mag), dtype=np.bool_)
+    for i in range(len(mag)):
+        fresh[i] = not is_stale(kept[0], 0, mag[i], chain[i], noise_sd)
+    return fresh
+
+
 def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: np.ndarray,
           mag: np.ndarray, params: OrientationParams,
           gyr_limits: float | np.ndarray = math.inf) -> Alignment:
@@ -180,7 +191,10 @@ def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: 
         nearest = np.searchsorted(imu_stamps, mag_stamps)
         mag = mag[:max(int(np.sum(nearest < used)), 1)]
         nearest = np.clip(nearest[:len(mag)], 0, used - 1)
-        field_first = _rotate_all(chain[nearest], np.ascontiguousarray(mag)).mean(axis=0)
+        mag = np.ascontiguousarray(mag)
+        fresh = _fresh(chain[nearest], mag, p.mag_noise_sd)
+        mag = mag[fresh]
+        field_first = _rotate_all(chain[nearest[fresh]], mag).mean(axis=0)
         field_norm = float(np.linalg.norm(field_first))
         inclination = math.asin(np.clip(-(field_first @ up) / max(field_norm, 1e-30), -1, 1))
         has_heading = math.cos(inclination) > _HORIZONTAL_SHARE

@@ -45,8 +45,8 @@ def realign(s, p, turned):
     s.counts.realigned += 1
     rest, noise = s.rest, s.block.noise
     for n in range(MOST_REFUTING):
-        if rest.refuting[n] == 0 or rest.refuting[n] == rest.settled:
-            rest.refuting[n] = rest.settled
+        if rest.refuting[n] == 0 or rest.refuting[n] == rest.changed:
+            rest.refuting[n] = rest.changed
             break
     force = rest.mean_force
     up = quat_rotate(s.quat_world_imu, (force[0], force[1], force[2]))

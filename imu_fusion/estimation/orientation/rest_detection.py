@@ -10,7 +10,7 @@ REST_MEMORY = 0.25        # s, of the means that the rest detector compares with
 _REST_TURN = 1.5e-3       # rad/s per axis: slower turning than 0.5 deg/s passes as rest
 _SDS2 = 9.0               # squared standard deviations of the bias within which a mean rate is bias
 _FORCE_OFF = 0.05         # of gravity: by how much a force at rest can differ from it
-_SURE_TURN = 0.2          # rad, that the force would have turned by where a bias is refuted
+_SURE_TURN = 0.2           # rad, that the force would have turned by where a bias is refuted
 _STEADY = 0.3             # of the rate, by which its mean may change where it is bias
 _STEEP = 2.0              # tan of the angle to the vertical within which a rate can be a turn
 
@@ -42,7 +42,7 @@ def is_still(s, p):
         rest.settled = 0
     else:
         rest.since = s.stamp
-        if rest.settled == 0 and s.stamp - rest.changed > enough:
+        if rest.settled == 0 and (s.stamp - rest.changed > enough or _is_known_to_refute(rest)):
             rest.settled = s.stamp
             for i in range(3):
                 rest.settled_force[i] = rest.mean_force[i]
@@ -63,9 +63,8 @@ def refuted_turn(s, p):
     rest = s.rest
     if not p.use_acc or rest.settled == 0:
         return 0.0
-    for n in range(MOST_REFUTING):
-        if rest.refuting[n] == rest.settled:    # the smoother knows what is to come
-            return _SURE_TURN
+    if _is_known_to_refute(rest):
+        return _SURE_TURN
     force = rest.mean_force
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     if abs(size - s.gravity) >= _FORCE_OFF * s.gravity:    # or there is none at all
@@ -88,3 +87,12 @@ def refuted_turn(s, p):
     if along ** 2 > _STEEP ** 2 * across2 or turned < _SURE_TURN + 3.0 * math.sqrt(moved2):
         return 0.0
     return turned
+
+
+@njit
+def _is_known_to_refute(rest):
+    """Whether the smoother knows what this rest, at its beginning, is to show."""
+    known = False
+    for n in range(MOST_REFUTING):
+        known |= rest.refuting[n] == rest.changed != 0
+    return known

@@ -50,7 +50,7 @@ REST = np.dtype([
     ("settled_force", "f8", 3),          # mean_force at that stamp
     ("settled_rate", "f8", 3),           # mean_rate, likewise
     ("turn", "f8", 3),                   # rad, that the rates less their bias make since then
-    ("refuting", "i8", MOST_REFUTING),   # ``settled`` of rests that refuted a bias; 0: no more
+    ("refuting", "i8", MOST_REFUTING),   # ``changed`` of rests that refuted a bias; 0: no more
 ], align=True)
 """The rest detector (rest_detection)."""
 
@@ -188,6 +188,7 @@ STATE = np.dtype([
     ("position_likelihood", "f8"),       # of positions, likewise
     ("is_anchored", "?"),                # whether the heading is that of the first needle
     ("anchor", "f8", 12),                # rad, of that per hard (3) and soft iron (9)
+    ("first_tilt_var", "f8"),            # rad^2, of what the first tilt turned that needle by
     ("field_scatter", "f8"),             # mean square per axis about ``field`` while moving
     ("scattered", "i8"),                 # blocks that it is the mean of
     ("heading_var", "f8"),               # rad^2, of a heading that no filter can improve on

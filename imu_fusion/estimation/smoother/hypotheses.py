@@ -22,11 +22,15 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.noise_fit import fit_noise
 from imu_fusion.estimation.smoother.problem import log_density
 from imu_fusion.estimation.smoother.profile_fit import profile_error, widened_by_profile
-from imu_fusion.estimation.smoother.receiver_fit import clock_error, lever_errors
+from imu_fusion.estimation.smoother.receiver_fit import (
+    clock_error,
+    delay_of_fixes,
+    height_error,
+    lever_errors,
+)
 from imu_fusion.estimation.smoother.remarks import MOST_EXCESS, MOST_FIRST_EXCESS, is_many
 from imu_fusion.estimation.smoother.result import SmootherResult
 from imu_fusion.estimation.smoother.sensor_lag import field_lag
-from imu_fusion.estimation.smoother.state import VEL
 from imu_fusion.estimation.smoother.touch_down import is_doubtful, stands_at_touch_down
 from imu_fusion.estimation.smoother.whiteness import correlation, wandering
 
@@ -38,10 +42,10 @@ _DELAY, _VELOCITY_DELAY = "gnss.time_offset_sd", "gnss.velocity_time_offset_sd"
 _LEVER = "gnss.lever_arm_sd"
 _SHIFTED = 3.0       # standard deviations of an error of the antenna, which is tried
 _DRIFTS = 12.0       # and of the clock: velocities of a real receiver, whose lag varies, get to 6
+_SCALED, _MUCH = 10.0, 0.2   # standard deviations of a scale of heights, and the least of it
 _LEVER_SD = 1.0      # m, or twice as far as the antenna is said to be: what a wrong sign makes
 _CLOCK_TRIES = 4     # a trajectory that is bent by a clock tells a part of what it is off by
 _LONGEST_DELAY = 2.0   # s, of fixes alone; velocities tell what is longer, see gnss_lag
-_STEP_OF_DELAY = 0.1   # s, for which its likelihood is taken
 _PERHAPS = 1.0       # standard deviation of a delay that is tried: far from it they err
 _LAG_TRIES = 3       # what turns to and fro within a lag tells only a part of it
 _FIELD_TRIES = 3     # a magnetometer that counts less leaves larger residuals
@@ -98,6 +102,7 @@ def likelier(found: Attempt, model: Model, smooth: Callable[[Model], Attempt]) -
     if (model.params.maximum_likelihood != "off" and "velocity" not in found.result.innovations
             and len(found.result.innovations.get("fix", ((),))[0]) >= _FEWEST):
         found, model = _late_fixes(found, model, smooth)
+        found, model = _other_clock(found, model, smooth)
     # Readings in a row far beside the trajectory are no noise either.
     if (model.params.maximum_likelihood == "off" or fits(found.result)
             or _many_outliers(found.result)):
@@ -127,13 +132,9 @@ def _other_antenna(found, model, smooth):
         sds = max(abs(error.sds) for error in lever_errors(found.problem))
         if sds < _SHIFTED * found.result.wander.get("fix", 1.0):
             break
-        best = found, model
-        for other in (*_where_zero(model, {_LEVER: sd}), *_delays(found, model),
-                      *_where_zero(model, {_DELAY: 0.2, _VELOCITY_DELAY: 0.2})):
-            tried = _smoothed(other, smooth)
-            if tried is not None and _gained(tried, found) > max(
-                    _GAIN, _gained(best[0], found)):
-                best = tried, other
+        others = (*_where_zero(model, {_LEVER: sd}), *_delays(found, model),
+                  *_where_zero(model, {_DELAY: 0.2, _VELOCITY_DELAY: 0.2}))
+        best = _likeliest(found, model, others, smooth)
         if best[0] is found:
             break
         found, model = best
@@ -148,9 +149,8 @@ def _other_clock(found, model, smooth):
                              _DRIFTS * found.result.wander.get("fix", 1.0)):
             break
         other = model._replace(clock_rate=model.clock_rate + error.size)
-        best = found, model
-        for tried in (other, *_delays(found, other)):
-            best = _try(*best, tried, smooth, 0.0 if known else _GAIN)
+        best = _likeliest(found, model, (other, *_delays(found, other)), smooth,
+                          0.0 if known else _GAIN)
         if best[0] is found:
             break
         found, model = best
@@ -161,23 +161,25 @@ def _late_fixes(found, model, smooth):
     """With fixes alone that are late: a smooth path hardly contradicts seconds of that. Those of
     its ends alone would be free of either."""
     for other in _where_zero(model, {_DELAY: _LONGEST_DELAY}):
-        if abs(_lateness(found)) > _PERHAPS:
+        if abs(delay_of_fixes(found.problem).sds) > _PERHAPS:
             found, model = _try(found, model, other, smooth)
     return found, model
 
 
-def _lateness(found):
-    """Standard deviations by which the delay of the fixes seems not to be zero."""
-    problem = found.problem
-    sample = np.repeat(np.arange(len(problem.x)), np.diff(problem.reading_start))
-    of_fix = np.isin(problem.readings["kind"], (FIX, MOVED_FIX))
-    ahead = np.where(of_fix[:, None], problem.x[sample, VEL:VEL + 3], 0.0)
-    return problem.shift(_STEP_OF_DELAY, readings=ahead)[1]
+def _scale_of_heights(found):
+    """How many times as much as the body heights of fixes alone surely change; else 1. Velocities
+    would contradict them."""
+    if "velocity" in found.result.innovations:
+        return 1.0
+    error = height_error(found.problem)
+    sure = abs(error.sds) > _SCALED * found.result.wander.get("fix", 1.0)
+    return 1.0 + error.size if sure and abs(error.size) > _MUCH else 1.0
 
 
 def _adapted(found, model, given):
     """The result with what was taken in place of the parameters that were given."""
     return replace(found.result, noise=dict(model.noise), stands=model.stands,
+                   height_scale=_scale_of_heights(found),
                    profile=model.profile, late=dict(model.late), clock_rate=model.clock_rate,
                    centre=other_centre(found.problem),
                    clipped_forces=clipped_forces(found.problem), adapted={
@@ -267,14 +269,10 @@ def _other_time(found, model, smooth):
         # Recovered rates are of no single time.
         if not lag or found.problem.imu.log.gyr_sd is not None:
             break
-        best = found, model
-        for name, more in (("mag", lag), ("gyr", -lag)):
-            if model.late and name not in model.late:
-                continue
-            other = model._replace(late={name: model.late.get(name, 0.0) + more})
-            tried = _smoothed(other, smooth)
-            if tried is not None and _gained(tried, best[0]) > 0.0:
-                best = tried, other
+        others = [model._replace(late={name: model.late.get(name, 0.0) + more})
+                  for name, more in (("mag", lag), ("gyr", -lag))
+                  if not model.late or name in model.late]
+        best = _likeliest(found, model, others, smooth, 0.0)
         if best[0] is found:
             break
         found, model = best
@@ -390,10 +388,18 @@ def _where_zero(model, changes):
 
 def _try(found, model, other, smooth, gain=_GAIN):
     """The attempt and model that are likelier by a gain, else those found."""
-    tried = _smoothed(other, smooth)
-    if tried is None:
-        return found, model
-    return (tried, other) if _gained(tried, found) > gain else (found, model)
+    return _likeliest(found, model, (other,), smooth, gain)
+
+
+def _likeliest(found, model, others, smooth, gain=_GAIN):
+    """The likeliest of attempts under other models, and its model, if it is by a gain; else those
+    found."""
+    best = found, model
+    for other in others:
+        tried = _smoothed(other, smooth)
+        if tried is not None and (gained := _gained(tried, found)) > gain:
+            best, gain = (tried, other), gained
+    return best
 
 
 def _smoothed(other, smooth):

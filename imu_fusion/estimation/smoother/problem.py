@@ -44,6 +44,7 @@ from imu_fusion.surfaces.constraint import Constraint
 _BEGINNING = 20_000_000_000   # ns, from which first attitudes are judged at least
 _MOVED = 20.0                 # sd of a fix, by which fixes have moved far beyond their noise
 _DELAY_SDS = 3.0              # standard deviations within which a delay of stamps is believed
+_UNLIKELY = 1e4               # standard deviations, beside which what is left is nothing
 # Squared standard deviations of the Cauchy loss by which first attitudes are judged: wide enough
 # that a start that errs for a while is told from one that errs throughout.
 _JUDGED = 25.0
@@ -277,16 +278,43 @@ class Problem:
                        make_storage(0, 0, n), make_scratch(n))
         return delta, cov
 
-    def shift(self, size: float, readings: np.ndarray | None = None,
-              contacts: np.ndarray | None = None, first: int = 0, last: int | None = None,
+    def weights(self) -> np.ndarray:
+        """Roots (M,) of the weights by which readings count."""
+        return 1.0 / np.sqrt(1.0 + np.sum(self.fit["residual"] ** 2, axis=1)
+                             / self.readings["loss"])
+
+    def curvature(self, change: np.ndarray, slope: float) -> float:
+        """Of the negative logarithm of the likelihood, linear about the trajectory, along a change
+        (M, 3) of the values of readings, whose weights stay as they are.
+
+        Args:
+            slope: along the change, in which the likelihood is a parabola.
+        """
+        readings = self.readings.copy()
+        readings["whiten"] *= self.weights()[:, None, None]
+        readings["loss"] = np.inf
+        sizes = np.linalg.norm(np.einsum("mij,mj->mi", readings["whiten"], change))
+        if not sizes > 0.0:
+            return 0.0
+        # So large that nothing else makes readings unlikely: one pass tells it.
+        size = _UNLIKELY * np.sqrt(len(readings)) / float(sizes)
+        readings["value"] += size * change
+        n = self.size
+        delta, cov = self.carried(0)
+        _, surprise = filter_segment(0, len(self.x), False, self.x, delta, cov,
+                                     self.recording._replace(readings=readings), self.fit.copy(),
+                                     make_storage(0, 0, n), make_scratch(n))
+        return 2.0 * (surprise - size * slope) / size ** 2
+
+    def shift(self, size: float, contacts: np.ndarray, first: int = 0, last: int | None = None,
               begin: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[float, float]:
-        """How large, in units of ``size``, a shift of rows seems to be, and by how many standard
-        deviations that is not zero: the likelihood, linear about the trajectory, is a parabola in
-        it (score test: Rao 1948).
+        """How large, in units of ``size``, a shift of contacts with the surface seems to be, and by
+        how many standard deviations that is not zero: the likelihood, linear about the trajectory,
+        is a parabola in it (score test: Rao 1948).
 
         Args:
             size: for which the likelihood is taken.
-            readings: (M, 3) of values, for a shift of one. contacts: (r,) m, likewise.
+            contacts: (r,) m, for a shift of one.
             first: sample before which there is no shift. last: sample before which rows count.
             begin: what :meth:`carried` has before the rows of ``first``.
         """
@@ -295,16 +323,11 @@ class Problem:
         fit, storage, scratch = self.fit.copy(), make_storage(0, 0, n), make_scratch(n)
         found = []
         for factor in (-size, 0.0, size):
-            shifted = self.recording
-            if readings is not None:
-                shifted = shifted._replace(readings=shifted.readings.copy())
-                shifted.readings["value"] += factor * readings
-            if contacts is not None:
-                shifted = shifted._replace(contacts=shifted.contacts.copy())
-                shifted.contacts["residual"] += factor * contacts
+            shifted = self.contacts.copy()
+            shifted["residual"] += factor * contacts
             found.append(float(filter_segment(
                 first, len(self.x) if last is None else last, False, self.x, delta.copy(),
-                cov.copy(), shifted, fit, storage, scratch)[1]))
+                cov.copy(), self.recording._replace(contacts=shifted), fit, storage, scratch)[1]))
         less, middle, more = found
         curvature, slope = less + more - 2.0 * middle, 0.5 * (less - more)
         if not curvature > 0.0:

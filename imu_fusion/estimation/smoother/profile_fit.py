@@ -51,7 +51,7 @@ def profile_error(problem: Problem, events: JumpEvents) -> ProfileError:
         shapes = [np.clip((at_rows - begins) / _GROWS, 0.0, 1.0)]
         if not begins:
             shapes.append(1.0 * (at_rows > 0.0))
-        found += [ProfileError(*problem.shift(size, None, shape, first, last, begin))
+        found += [ProfileError(*problem.shift(size, shape, first, last, begin))
                   for shape in shapes]
     return max(found, key=lambda error: abs(error.sds))
 

@@ -112,6 +112,10 @@ def _on_stamps(result):
                f"millionths {'faster' if result.clock_rate > 0.0 else 'slower'} than that of the "
                "Imu; their stamps were taken as much closer to the middle of the recording or "
                "farther from it. Give both the stamps of one clock")
+    if result.height_scale != 1.0:
+        yield (f"heights of the fixes change {result.height_scale:.1f} times as much as forces "
+               "say, or more: they may be in another unit, as feet (3.28), and all "
+               "heights are off by as much. Give fixes their heights in metres")
     for name, lag in result.late.items():
         what, other = _SENSORS[name], _SENSORS["gyr" if name == "mag" else "mag"]
         yield (f"{what} are {abs(lag) * 1e3:.0f} ms {'late' if lag > 0.0 else 'early'} against "

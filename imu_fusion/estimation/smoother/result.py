@@ -101,6 +101,7 @@ class SmootherResult:
     ``late``: "gyr" or "mag" -> s, by which these were found later than the accelerometer.
     ``clock_rate``: by which the receiver's clock was found to run faster than that of the Imu, in
     the middle of the recording right; its stamps were taken in time of the Imu.
+    ``height_scale``: how many times as much as the body heights of the fixes change, at least.
     ``lost_turns``: stamps (ns) from which on the attitude is one of several that are about as
     likely: the turn about the field had been lost.
     ``centre``: (3,) m from the accelerometers, of a tumbling body whose surface.lever_arm is
@@ -136,6 +137,7 @@ class SmootherResult:
     profile: ProfileError = ProfileError()
     late: dict[str, float] = field(default_factory=dict)
     clock_rate: float = 0.0
+    height_scale: float = 1.0
     lost_turns: tuple[int, ...] = ()
     centre: np.ndarray | None = None
     clipped_forces: tuple[int, float] = (0, np.inf)

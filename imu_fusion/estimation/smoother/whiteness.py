@@ -13,7 +13,7 @@ _FEWEST = 3              # innovations in a block, and blocks
 _LARGEST = 6.0           # standard deviations, to which single ones are cut: outliers are no drift
 _EXCESS = 1.6            # simulated jumps and drives with the right noise: up to 1.4
 _CORRELATED = 0.3        # neighbours; simulated jumps and drives with the right noise: up to 0.2
-_CHANCE = 1e-3           # of a component of white noise to be called wandering
+_CHANCE = 1e-3           # of white noise to be called wandering
 
 
 def wandering(stamp: np.ndarray, innovations: np.ndarray) -> float:
@@ -26,15 +26,17 @@ def wandering(stamp: np.ndarray, innovations: np.ndarray) -> float:
         stamp: (n,) ns. innovations: (n, k), normalised.
     """
     cut = np.clip(innovations, -_LARGEST, _LARGEST)
-    excess, time = 1.0, _BLOCK
+    times, time = [], _BLOCK
     while len(stamp) and stamp[-1] - stamp[0] >= (_FEWEST - 1) * time:
-        excess = max(excess, _excess((stamp - stamp[0]) // time, cut))
+        times.append(time)
         time *= 2
-    return excess
+    return max((_excess((stamp - stamp[0]) // time, cut, len(times)) for time in times),
+               default=1.0)
 
 
-def _excess(block, values):
-    """RMS of the means in blocks, of the component in which it is largest; 1 by chance."""
+def _excess(block, values, tries):
+    """RMS of the means in blocks, of the component in which it is largest; 1 by chance, which has
+    a number of tries."""
     block = np.unique(block, return_inverse=True)[1]
     count = np.bincount(block)
     means = np.column_stack([np.bincount(block, c) / np.sqrt(count) for c in values.T])
@@ -43,7 +45,7 @@ def _excess(block, values):
     if n < _FEWEST:
         return 1.0
     excess = float(np.sqrt(np.mean(means ** 2, axis=0).max()))
-    by_chance = np.sqrt(scipy.stats.chi2.isf(_CHANCE, n) / n)
+    by_chance = np.sqrt(scipy.stats.chi2.isf(_CHANCE / (tries * values.shape[1]), n) / n)
     return excess if excess > max(_EXCESS, by_chance) else 1.0
 
 

@@ -188,6 +188,17 @@ def test_what_a_driver_fills_in_is_as_if_it_had_not_come(tumbling):
     assert error[0] < 1.2 * error[1]
 
 
+def test_what_repeats_in_a_start_in_motion_is_no_part_of_its_field(tumbling):
+    imu, mag, truth = tumbling
+    moving = slice(np.searchsorted(imu.stamp, imu.stamp[0] + 8_000_000_000), None)
+    held = MagLog(mag.stamp, mag.mag[np.arange(len(mag)) // 10 * 10])
+    held = held[mag.stamp >= imu.stamp[moving][0]]
+    estimator = make({})
+    estimator.run(imu[moving], held)
+    norm = np.linalg.norm(mag.mag, axis=1).mean()
+    assert abs(estimator.summary()["field_norm_ut"] * 1e-6 / norm - 1.0) < 0.01
+
+
 def test_a_coarse_magnetometer_at_rest_repeats_and_is_used():
     imu, mag, _, _ = simulate(Tumbling(seed=6, rest=10.0), 10.0, rate=100.0, mag_rate=50.0,
                               sensors=NOISY, seed=5)

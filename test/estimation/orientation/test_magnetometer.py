@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_fusion.estimation.orientation.estimator import OrientationEstimator, OrientationParams
 from imu_fusion.estimation.orientation.rows import FLAG_MAG_DISTURBED, FLAG_NO_HEADING
-from imu_fusion.samples.logs import MagLog
+from imu_fusion.samples.logs import ImuLog, MagLog
 from imu_fusion.simulation.rotation import Sensors, Tumbling, earth_field, simulate
 from test.estimation.orientation.errors import local_errors, rmse_deg
 from test.estimation.orientation.ordinary import ORDINARY
@@ -121,3 +121,20 @@ def test_iron_left_over_is_part_of_the_heading_that_rest_anchors():
     rows = make({"fusion.mag_matrix_sd": 0.0, "fusion.mag_offset_sd": 0.0,
                  "fusion.local_field_sd": 0.01}).run(imu, mag)
     assert math.sqrt(rows["cov_attitude"][-1][2, 2]) < math.radians(1.5)
+
+
+def test_a_heading_from_a_first_tilt_that_was_wrong_is_as_uncertain_as_that_made_it():
+    """1 m/s^2 along x tilts the first sample by 5.8 deg, and a needle that dips by 63 deg is turned
+    by tan(63 deg) times as much. Turning tells the tilt, but not what became of that."""
+    motion = Tumbling(seed=3, quat_start=(0.0, 0.0, 0.0, 1.0), travel_sd=0.2)
+    imu, mag, truth, _ = simulate(motion, 12.0, rate=100.0, seed=3)
+    imu = ImuLog(imu.stamp, imu.gyr, imu.acc + [1.0, 0.0, 0.0], imu.frame_id)
+    rows = OrientationEstimator(OrientationParams(declination_deg=0.0).replace(
+        **{"sensor.acc_bias_sd": 1.0})).run(imu, mag)
+    error = (Rotation.from_quat(rows["quat_world_imu"][-1])
+             * Rotation.from_quat(truth.quat_world_imu[-1]).inv()).as_rotvec(degrees=True)
+    to_world = Rotation.from_quat(truth.quat_world_imu[-1]).as_matrix()
+    sd = np.degrees(np.sqrt(np.diag(to_world @ rows["cov_attitude"][-1] @ to_world.T)))
+    assert np.abs(error[:2]).max() < 1.0 < 3.0 * sd[:2].min()
+    assert abs(error[2] - math.degrees(math.asin(0.101)) * math.tan(math.radians(63.0))) < 1.5
+    assert 0.5 * abs(error[2]) < sd[2] < 2.0 * abs(error[2])

@@ -40,6 +40,10 @@ def test_a_rest_refutes_a_bias_that_was_thought_to_be_known(coming_to_rest, mode
     rows = estimator.run(imu)
     assert estimator.summary()["realigned"] == 1
     assert "stood still" in estimator.remarks()[0]
+    # It takes seconds to show: the smoother knows it from the beginning of the rest on.
+    rest = LENGTH - _ComingToRest.forwards.rest
+    begun = (imu.stamp > int((rest + 1.0) * 1e9)) & (imu.stamp < int((rest + 1.5) * 1e9))
+    assert mode == "causal" or tilt_errors_deg(rows, truth)[begun].max() < 2.0
     late = imu.stamp > int((LENGTH - 3.0) * 1e9)
     assert (rows["flags"][late] & FLAG_STILL).all()
     tilt = tilt_errors_deg(rows, truth)[late]

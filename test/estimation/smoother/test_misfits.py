@@ -61,7 +61,7 @@ def up_error(result, fix):
 
 
 @pytest.mark.parametrize(("step", "begin", "with_velocity"), [
-    (48.0, 0.5, True), (48.0, 0.7, True), (-15.0, 0.4, True), (48.0, 0.5, False)])
+    (48.0, 0.7, True), (-15.0, 0.4, True), (48.0, 0.5, False)])
 def test_a_step_of_the_height_datum_is_found_and_said(logs, step, begin, with_velocity):
     imu, mag, fix, velocity = logs
     first = int(begin * len(fix))
@@ -197,7 +197,7 @@ def test_fixes_that_are_small_and_alike_are_not_averaged_away():
     errors = walking.WalkErrors(gnss_rate=1.0, stated_sd=(4.0, 4.0, 6.0), gnss=GnssErrors(
         position_sd=(3.0, 3.0, 6.0), position_tau=30.0, correlated_share=0.97,
         velocity_sd=(0.3, 0.3, 0.3)))
-    result, error, _ = walked(100.0, errors, 1)()
+    result, error, _ = walked(60.0, errors, 1)()
     assert "gnss.position_error_sd" in result.adapted
     # One error of each axis for minutes: NEES of three numbers, below 16.3 in 999 of 1000.
     assert nees(error, result.samples["cov_position"]).mean() < 16.3
@@ -237,7 +237,7 @@ def test_a_receiver_at_rest_may_repeat_itself():
 
 @pytest.mark.parametrize(("fixes", "velocities"), [(-2.0, 0.0), (0.0, 2.0)])
 def test_fixes_and_velocities_of_two_clocks(fixes, velocities):
-    walk = walking.Walk(60.0, np.random.default_rng(8))
+    walk = walking.Walk(40.0, np.random.default_rng(8))
     recorded = walking.record(walk, np.random.default_rng(9))
     result = Smoother().run(recorded.imu, recorded.mag, later(recorded.fix, fixes),
                             later(recorded.velocity, velocities))

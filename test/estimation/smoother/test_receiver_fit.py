@@ -48,6 +48,15 @@ def test_a_receiver_whose_clock_runs_slower():
     assert any("millionths slower" in text for text in result.remarks())
 
 
+def test_fixes_alone_whose_heights_are_in_feet():
+    walk, recorded = walked()
+    for unit, said in ((0.3048, True), (1.0, False)):
+        result = Smoother().run(recorded.imu, recorded.mag, dataclasses.replace(
+            recorded.fix, height=recorded.fix.height / unit))
+        assert (1.5 < result.height_scale < 4.0) == said
+        assert any("heights of the fixes" in text for text in result.remarks()) == said
+
+
 def test_antenna_and_clock_as_they_are_said_to_be():
     walk, recorded = walked(lever_arm=tuple(LEVER))
     result = Smoother(SmootherParams().replace(**{"gnss.lever_arm": tuple(LEVER)})).run(

@@ -43,6 +43,7 @@ def start_field(s, p, z, has_heading, follow):
     """
     cov = s.cov
     s.field_norm = math.sqrt(z[0] ** 2 + z[1] ** 2 + z[2] ** 2)
+    s.first_tilt_var = _turned_by_tilt(cov, z)
     s.field_scatter, s.scattered = _usual_scatter(p), 0
     b = (z[0] / s.field_norm, z[1] / s.field_norm, z[2] / s.field_norm)
     for i in range(3):
@@ -58,6 +59,18 @@ def start_field(s, p, z, has_heading, follow):
         s.heading_var = p.heading_sd ** 2
     _share_errors(s, p, b, has_heading, follow)
     judge_anchor(s, p)
+
+
+@njit
+def _turned_by_tilt(cov, z):
+    """Variance of what the error of the tilt turns the needle of ``z`` (3,), world axes, by: where
+    the field is steep, much of what is vertical is taken for horizontal."""
+    steep = z[2] / max(z[0] ** 2 + z[1] ** 2, (_HORIZONTAL_SHARE * z[2]) ** 2)
+    variance = 0.0
+    for i in range(2):
+        for j in range(2):
+            variance += z[i] * cov[es.ATTITUDE + i, es.ATTITUDE + j] * z[j]
+    return variance * steep ** 2
 
 
 @njit
@@ -96,11 +109,11 @@ def _share_errors(s, p, b, has_heading, follow):
 def judge_anchor(s, p):
     """Variance of an anchored heading, which no later sample changes.
 
-    Beside its own it has what the place and hard and soft iron turned the first needle by, iron so
-    far as it is known by now: what it is found to be, and what that leaves open. The filter takes
-    the first needle for true, hence iron for zero in that one pose, and of each state keeps only
-    what that leaves open. That much of its variance is no knowledge: it counts as the prior until
-    turning has made it smaller.
+    Beside its own it has what the first tilt's error, the place and hard and soft iron turned the
+    first needle by, iron so far as it is known by now: what it is found to be, and what that leaves
+    open. The filter takes the first needle for true, hence iron for zero in that one pose, and of
+    each state keeps only what that leaves open. That much of its variance is no knowledge: it
+    counts as the prior until turning has made it smaller.
     """
     if not s.is_anchored:
         return    # start_field's
@@ -118,7 +131,8 @@ def judge_anchor(s, p):
         open_part = min(s.cov[i, i] / one_pose, 1.0) if one_pose > 0.0 else 1.0
         variance += s.anchor[a] ** 2 * open_part * (hard if a < 3 else soft)
     place = _place_variance(s, p) * (s.anchor[0] ** 2 + s.anchor[1] ** 2 + s.anchor[2] ** 2)
-    s.heading_var = min(p.heading_sd ** 2 + place + turned ** 2 + variance, es.UNIFORM_VARIANCE)
+    s.heading_var = min(p.heading_sd ** 2 + s.first_tilt_var + place + turned ** 2 + variance,
+                        es.UNIFORM_VARIANCE)
 
 
 @njit
