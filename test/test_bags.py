@@ -1,10 +1,11 @@
 """The recordings in bags/: as described, readable by foreign tools, in SI units and our frames."""
 
 import hashlib
-import importlib.util
+import importlib
 import json
 import os
 import struct
+import sys
 from pathlib import Path
 
 import mcap.reader
@@ -26,9 +27,9 @@ REAL = sorted(name for name in MANIFEST if "simulated" not in name)
 BROAD = sorted(name for name in MANIFEST if name.startswith("broad_"))
 SOURCE = Path(os.environ.get("IMU_FUSION_DATA", ROOT.parent / "shared" / "data"))
 
-spec = importlib.util.spec_from_file_location("make_bags", BAGS / "make_bags.py")
-make_bags = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(make_bags)
+sys.path.insert(0, str(BAGS))
+make_bags = importlib.import_module("make_bags")
+sys.path.remove(str(BAGS))
 
 
 @pytest.mark.parametrize("name", MANIFEST)

@@ -102,9 +102,10 @@ def _explains(off, given, arms, force):
 def _nearest(arms, force):
     """The smallest correction (3,) m after which nothing is felt, as far as the turn tells one."""
     values, axes = np.linalg.eigh(np.einsum("nij,nik->jk", arms, arms))
-    told = axes[:, values > _TOLD * values[-1]]
-    right = told.T @ np.einsum("nij,ni->j", arms, force)
-    return -told @ (right / values[values > _TOLD * values[-1]])
+    told = values > _TOLD * values[-1]
+    axes = axes[:, told]
+    right = axes.T @ np.einsum("nij,ni->j", arms, force)
+    return -axes @ (right / values[told])
 
 
 def _normal(arms, force, weight):

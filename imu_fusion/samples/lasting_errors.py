@@ -149,6 +149,7 @@ def _stretches(imu, vectors, length):
     whole = np.abs(steps.sum(axis=1) * 1e-9 / interval - (size * group - 1)) < 0.05 * size * group
     for values in (rates, forces, vectors):
         whole &= np.isfinite(values).all(axis=(1, 2))
+    whole &= vectors.any(axis=(1, 2))    # zeros: there is no such sensor
     path = np.where(whole, np.linalg.norm(rates, axis=2).sum(axis=1), 0.0)
     best = np.argsort(-path, kind="stable")[:max(int(_MOST / (size * group * interval)), 1)]
     best = best[path[best] * group * interval > _TURNS]

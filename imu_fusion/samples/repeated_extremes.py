@@ -6,6 +6,7 @@ are equal far more often than those just below let expect, that is the end of th
 
 import numpy as np
 
+from imu_fusion.samples.equal_runs import equal_runs
 from imu_fusion.samples.flat_tops import LIMIT_TOLERANCE
 
 _FEWEST = 3          # equal extremes
@@ -22,7 +23,7 @@ def range_shown(values: np.ndarray, floor: float) -> np.ndarray:
     Args:
         values: (n, 3). floor: no sensor has a smaller range.
     """
-    size = np.abs(values[np.append(True, np.diff(values, axis=0).any(axis=1))[:len(values)]])
+    size = np.abs(values[equal_runs(values)[0]])
     limits = np.array([_shown(column, floor) for column in size.T])
     largest = size.max(axis=0, initial=0.0)
     if np.isfinite(limits).any():

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from imu_fusion.samples.equal_runs import equal_runs
 from imu_fusion.samples.findings import Finding
 from imu_fusion.samples.logs import ImuLog
 from imu_fusion.samples.turning import gravity_follows
@@ -46,10 +47,9 @@ def check_standing(imu: ImuLog, name: str) -> list[Finding]:
 def _longest_stand(column):
     """Slice of the longest run of equal values (n,), if it is far longer than usual and not at
     the end of the range; of all of them, if they never change."""
-    starts = np.concatenate([[0], np.flatnonzero(column[1:] != column[:-1]) + 1])
+    starts, lengths = equal_runs(column)
     if len(starts) == 1:
         return slice(0, len(column))
-    lengths = np.diff(np.concatenate([starts, [len(column)]]))
     k = int(np.argmax(lengths))
     first, length = int(starts[k]), int(lengths[k])
     usual = int(np.percentile(np.delete(lengths, k), 95))

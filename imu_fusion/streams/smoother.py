@@ -183,6 +183,7 @@ def smooth(params: SmoothingParams, logs: Mapping[str, Any]) -> SmootherResult:
     if found.mag_lag:    # the smoother may have found more of it
         late["mag"] = late.get("mag", 0.0) + found.mag_lag
     return replace(result, left_out=len(imu) - len(begun), late=late,
+                   lost_turns=tuple(sorted({*result.lost_turns, *found.lost})),
                    start_found=params.initial.start is None)
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from imu_fusion.estimation.orientation.mag_repeats import REPEATS, is_stale
 from imu_fusion.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
 from imu_fusion.kernels import njit
+from imu_fusion.samples.equal_runs import equal_runs
 from imu_fusion.sensors.saturation import saturated_axes
 
 if TYPE_CHECKING:
@@ -197,8 +198,7 @@ def search(iron: np.ndarray, stamps: np.ndarray, gyr: np.ndarray, limits: np.nda
 
 def _stands(gyr):
     """Mask (n,) of rates (n, 3) that repeat for long: at rest, which shows nothing, or stuck."""
-    begins = np.flatnonzero(np.append(True, (gyr[1:] != gyr[:-1]).any(axis=1)))
-    lengths = np.diff(np.append(begins, len(gyr)))
+    _, lengths = equal_runs(gyr)
     return np.repeat(lengths >= _STANDS, lengths)
 
 

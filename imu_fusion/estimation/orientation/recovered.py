@@ -19,15 +19,19 @@ from imu_fusion.sensors.unmixing import unmix
 
 _WILD = 1.1    # limits: nothing that was clipped lies beyond, whatever a calibration mixes
 _LATE = 2e-3   # s: less is what the estimate of a lag errs by
+_HARDER = (3.0, 10.0)   # times fusion.angular_acc_sd, that all is recovered with again
+_APART = 1.0   # rad in a burst, by which two of these differ: turns too many or too few
 
 
 class Recovered(NamedTuple):
     """``imu`` with recovered rates and their standard deviation ``gyr_sd``; ``mag``, earlier by
-    ``mag_lag`` s, where it was that much later than the rates (0: not, or by little)."""
+    ``mag_lag`` s, where it was that much later than the rates (0: not, or by little); ``lost``,
+    stamps (ns) of bursts whose rates hang on how hard blows are said to be."""
 
     imu: ImuLog
     mag: MagLog
     mag_lag: float
+    lost: tuple[int, ...]
 
 
 def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> Recovered:
@@ -44,6 +48,11 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> Recov
     misalignment stands still in the sensor: it goes together for as long as the body takes for
     half a turn.
 
+    The field is blind to a turn about it, and a blow that changes the spin faster than
+    ``fusion.angular_acc_sd`` says is explained by turns that never were. So all is recovered with
+    three times as much, too: what is taken must not hang on that. Where it still does with ten
+    times as much, rates are as unsure as these differ.
+
     Args:
         imu, mag: the whole recording. params: of method fusion; mode and range are set here.
 
@@ -58,20 +67,45 @@ def recover(imu: ImuLog, mag: MagLog | None, params: OrientationParams) -> Recov
               else np.broadcast_to(params.sensor.gyro_range, 3))
     tops = unmix(imu.gyr, limits, BAND)
     mixing = tops.matrix - np.eye(3)
-    rows, used, lag = _fused(imu, mag, imu.gyr, tops.clipped, limits, params)
-    if tops.known.any():
-        beyond = np.where(tops.clipped[used], rows["gyr"] - tops.seen[used], 0.0)
-        mixed = imu.gyr.copy()
-        mixed[used] += beyond @ mixing.T
-        rows, used, lag = _fused(imu, mag, mixed, tops.clipped, limits, params)
-    missing = tops.clipped[used]
+    rows, used, lag = _unmixed(imu, mag, tops, limits, params)
+    missing, apart = tops.clipped[used], np.zeros_like(rows["gyr"])
+    bursts = _bursts(missing.any(axis=1))
+    lost: list[slice] = []
+    for harder in _HARDER if bursts else ():
+        other = _unmixed(imu, mag, tops, limits, params.replace(
+            **{"fusion.angular_acc_sd": harder * params.fusion.angular_acc_sd}))
+        apart = other[0]["gyr"] - rows["gyr"]
+        lost = [burst for burst in bursts if _turn(apart[burst]) * _step(rows) > _APART]
+        if not lost:
+            break
+        if harder < _HARDER[-1]:
+            rows, used, lag = other
     recovered = np.where(missing, _in_bursts(rows, missing, params.fusion.angular_acc_time), 0.0)
     mixed_in = recovered @ np.abs(mixing).T
     sd = np.hypot(np.where(missing, recovered, mixed_in),
                   _misaligned(rows, params.sensor.gyro_scale_sd))
     lag = lag if abs(lag) > _LATE else 0.0
+    for burst in lost:
+        sd[burst] = np.maximum(sd[burst], np.abs(apart[burst]))
     return Recovered(ImuLog(rows["stamp"], rows["gyr"], rows["acc"], imu.frame_id, sd),
-                     replace(mag, stamp=mag.stamp - np.int64(round(lag * 1e9))), lag)
+                     replace(mag, stamp=mag.stamp - np.int64(round(lag * 1e9))), lag,
+                     tuple(int(rows["stamp"][burst.start]) for burst in lost))
+
+
+def _turn(rates):
+    """The largest sum of rates (n, 3) up to any of them."""
+    return float(np.linalg.norm(np.cumsum(rates, axis=0), axis=1).max())
+
+
+def _unmixed(imu, mag, tops, limits, params):
+    """:func:`_fused` of rates into which what was missing of others is mixed."""
+    rows, used, lag = _fused(imu, mag, imu.gyr, tops.clipped, limits, params)
+    if not tops.known.any():
+        return rows, used, lag
+    mixed = imu.gyr.copy()
+    mixed[used] += np.where(tops.clipped[used], rows["gyr"] - tops.seen[used], 0.0) @ (
+        tops.matrix - np.eye(3)).T
+    return _fused(imu, mag, mixed, tops.clipped, limits, params)
 
 
 def _fused(imu, mag, gyr, clipped, limits, params):
@@ -118,7 +152,12 @@ def _run_lengths(mask):
     """(n, k): length of the run of True that an element is in, 0 where False."""
     lengths = np.zeros(mask.shape)
     for column, out in zip(mask.T, lengths.T):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2):
-            out[begin:end] = end - begin
+        for run in _bursts(column):
+            out[run] = run.stop - run.start
     return lengths
+
+
+def _bursts(mask):
+    """Slices of the runs of True in a mask (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [slice(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

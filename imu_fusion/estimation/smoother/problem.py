@@ -21,7 +21,7 @@ from imu_fusion.estimation.smoother.measurements.registry import (
 from imu_fusion.estimation.smoother.measurements.surface_contact import (
     Spread,
     evaluate_constraints,
-    in_free_fall,
+    in_flight,
     put_lever_derivatives,
     surface_points,
 )
@@ -121,7 +121,7 @@ class Problem:
         self.delays = [i for i in (getattr(prior.blocks, name) for name in DELAYS) if i >= 0]
         self.model = model_of(prior, around, params.gnss.lever_arm)
         self.intervals = intervals_of(imu.steps, imu.means, imu.noise)
-        self.free = in_free_fall(imu.log, around.gravity, params.surface.lever_arm)
+        self.free = in_flight(imu.log, around.gravity, params.surface.lever_arm)
         self.contact_start = np.zeros(len(imu.log) + 1, np.int64)
         self.contacts = np.empty(0, CONTACT)
         self._start()

@@ -168,7 +168,7 @@ def test_uncertainty_is_honest(mode, mounting):
         # Accelerations of 400 m/s^2 from the first sample on would make 2 deg a matter of second
         # order: here they begin with 40.
         params = params.replace(**{"motion.acceleration_rate_density": 30.0, "gravity": 1.0})
-    found = _normalised_errors(params, realisations, 120, seed=8, **mounting)
+    found = _normalised_errors(params, realisations, 60, seed=8, **mounting)
     # 95 % of chi-square, divided among the five quantities (Bonferroni).
     low, high = chi2.ppf([0.005, 0.995], 3 * realisations) / realisations
     assert np.all((low < found) & (found < high)), found

@@ -124,8 +124,8 @@ def test_iron_left_over_is_part_of_the_heading_that_rest_anchors():
 
 
 def test_a_heading_from_a_first_tilt_that_was_wrong_is_as_uncertain_as_that_made_it():
-    """1 m/s^2 along x tilts the first sample by 5.8 deg, and the needle of a field that dips by 63
-    deg by tan(63 deg) times as much. Turning tells the tilt; of the heading no later sample does."""
+    """1 m/s^2 along x tilts the first sample by 5.8 deg, and a needle that dips by 63 deg is turned
+    by tan(63 deg) times as much. Turning tells the tilt, but not what became of that."""
     motion = Tumbling(seed=3, quat_start=(0.0, 0.0, 0.0, 1.0), travel_sd=0.2)
     imu, mag, truth, _ = simulate(motion, 12.0, rate=100.0, seed=3)
     imu = ImuLog(imu.stamp, imu.gyr, imu.acc + [1.0, 0.0, 0.0], imu.frame_id)

@@ -11,13 +11,17 @@ from imu_fusion.demos.data import data_folder
 from imu_fusion.errors import EstimationError, ParameterError
 from imu_fusion.estimation.smoother import Smoother, SmootherParams
 from imu_fusion.estimation.smoother.jump_events import JumpEvents
-from imu_fusion.estimation.smoother.measurements.surface_contact import evaluate_constraints
+from imu_fusion.estimation.smoother.measurements.surface_contact import (
+    evaluate_constraints,
+    in_flight,
+)
 from imu_fusion.estimation.smoother.params import Gnss, SurfaceContact
 from imu_fusion.estimation.smoother.profile_fit import ProfileError, widened_by_profile
 from imu_fusion.estimation.smoother.result import SAMPLE
 from imu_fusion.estimation.smoother.surface_fit import surface_fits
 from imu_fusion.estimation.smoother.surface_place import fixes_beside, widen_place
 from imu_fusion.geometry.geodesy import LocalFrame
+from imu_fusion.samples.logs import ImuLog
 from imu_fusion.simulation.jump_sensors import EPOCH, GnssErrors, record
 from imu_fusion.simulation.ski_jump import FASTEST_WOBBLE
 from imu_fusion.surfaces.constraint import Surface, height_constraint
@@ -209,7 +213,8 @@ def test_a_grid_that_ends_says_so(jump, recording):
 
     r = Smoother(SmootherParams(), Grid(jump.hill.origin)).run(
         recording.imu, recording.mag, recording.fix, recording.velocity)
-    known = (jump.hill.to_hill(recording.motion.position_world)[:, 0] < -40.0).mean()
+    held = ~in_flight(recording.imu, 9.81, (0.0, 0.0, 0.0))    # flying, it asks no surface
+    known = (jump.hill.to_hill(recording.motion.position_world)[held, 0] < -40.0).mean()
     assert abs(r.surface["grid"].silent - (1.0 - known)) < 0.01
     assert any("says nothing at 6" in text for text in r.remarks()), (known, r.remarks())
 
@@ -219,3 +224,11 @@ def test_a_surface_elsewhere_is_refused(jump, recording):
     with pytest.raises(EstimationError, match="origin is 1[0-9][0-9] km from the start"):
         Smoother(SmootherParams(), away).run(recording.imu, recording.mag, recording.fix,
                                              recording.velocity)
+
+
+def test_what_is_dragged_at_in_flight_is_not_held_and_what_slides_is():
+    time = np.arange(300)
+    felt = np.select([(time > 50) & (time < 100), time > 200], [0.4 * 9.81, 0.64 * 9.81], 9.81)
+    log = ImuLog(10_000_000 * time, np.zeros((300, 3)), np.outer(felt, [0.0, 0.6, 0.8]))
+    free = in_flight(log, 9.81, (0.0, 0.0, 0.0))
+    assert np.array_equal(np.flatnonzero(free), np.arange(51, 100))

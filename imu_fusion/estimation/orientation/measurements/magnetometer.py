@@ -63,8 +63,8 @@ def start_field(s, p, z, has_heading, follow):
 
 @njit
 def _turned_by_tilt(cov, z):
-    """Variance of what the error of the tilt turns the needle by that ``z`` (3,), world axes, shows:
-    where the field is steep, much of what is vertical is taken for horizontal."""
+    """Variance of what the error of the tilt turns the needle of ``z`` (3,), world axes, by: where
+    the field is steep, much of what is vertical is taken for horizontal."""
     steep = z[2] / max(z[0] ** 2 + z[1] ** 2, (_HORIZONTAL_SHARE * z[2]) ** 2)
     variance = 0.0
     for i in range(2):

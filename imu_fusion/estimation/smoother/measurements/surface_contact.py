@@ -20,6 +20,10 @@ from imu_fusion.samples.free_fall import force_at, free_falls
 from imu_fusion.samples.logs import ImuLog, seconds
 from imu_fusion.surfaces.constraint import Constraint
 
+# g: what stands, slides or rolls on a slope feels more (cos 50 deg = .64); in flight a dense flow
+# drags at a body, and calibrations err, so that it may feel more than the .25 of a free fall.
+_HELD = 0.5
+
 
 class Spread(NamedTuple):
     """Covariances (N, 3, 3) m^2 of positions; None: nothing is known of them yet."""
@@ -42,11 +46,13 @@ def surface_points(position_world: np.ndarray, quat_world_imu: np.ndarray,
     return position_world + attitude.apply(np.array(lever_imu))
 
 
-def in_free_fall(log: ImuLog, gravity: float, lever_imu: Sequence[float]) -> np.ndarray:
-    """Mask (N,) of the samples at which a point (3,) m of the body is in free fall."""
+def in_flight(log: ImuLog, gravity: float, lever_imu: Sequence[float]) -> np.ndarray:
+    """Mask (N,) of the samples at which a body whose point (3,) m is held by a surface feels too
+    little for that."""
     time = seconds(log.stamp, log.stamp[0])
     free = np.zeros(len(log), bool)
-    for start, end in free_falls(time, force_at(lever_imu, time, log.acc, log.gyr), gravity):
+    force = force_at(lever_imu, time, log.acc, log.gyr)
+    for start, end in free_falls(time, force, gravity, _HELD):
         free[start:end] = True
     return free
 
@@ -93,7 +99,7 @@ def evaluate_constraints(constraints: Sequence[Constraint], position_world: np.n
         stamp: (N,) ns.
         events: take-off and touch-down, or None when no constraint needs them.
         params: ``jump.event_margin`` around the events heights are free.
-        free: mask (N,) of the samples :func:`in_free_fall`, at which nothing holds that holds
+        free: mask (N,) of the samples :func:`in_flight`, at which nothing holds that holds
             always; None: none.
         spread: of the positions; None: rough surfaces, too, are linearised where they are.
 
