@@ -43,8 +43,8 @@ SLOW = {rate: simulate_impact(ImpactScene(ground=-1e9, omega=(3.0, 10.0, 5.0)), 
 def layout(**changes) -> dict[str, AccelerometerParams]:
     """The four accelerometers of the paper about the centre of its ellipsoid."""
     return {name: AccelerometerParams(
-        position=tuple(place), axes=tuple(axes.ravel()), bias_sd=BIAS,
-        **({"noise_density": NOISE / 1000 ** 0.5} | changes))
+        position=tuple(place), axes=tuple(axes.ravel()),
+        **({"noise_density": NOISE / 1000 ** 0.5, "bias_sd": BIAS} | changes))
         for name, place, axes in zip(NAMES, PLACES, PAPER_AXES)}
 
 
@@ -336,15 +336,22 @@ FIELD_ROWS = [
     field_row("clipped at 20 m/s^2, no range given", "NEES 4e5",
               lambda rng: np.clip(felt(rng), -20.0, 20.0)),
     field_row("clipped at 80 m/s^2, no range given", "", lambda rng: np.clip(felt(rng), -80, 80)),
+    field_row("clipped at 80 m/s^2, range: 80 as the remark says", "",
+              lambda rng: np.clip(felt(rng), -80, 80), {"range": (80.0,)}),
     field_row("clipped at 78.4532, range: 78.453", "detection off",
               lambda rng: np.clip(felt(rng), -78.4532, 78.4532), {"range": (78.4533,)}),
     field_row("jitter of 2 ms that no stamp tells", "NEES 190",
               lambda rng: felt(rng, jitter=2e-3)),
+    field_row("the same, noise_scale raised as the remark says", "",
+              lambda rng: felt(rng, jitter=2e-3), noise_scale=10.0),
     field_row("one of four reads half", "", half),
     field_row("one of four is 3 ms late", "", late_by_three),
     field_row("x and y of one of four exchanged, 1 mm and 2 deg off", "", axes_exchanged),
     field_row("a fifth of the samples of one of four lost, 1 mm and 2 deg off", "", a_fifth_lost),
     field_row("rounded to 2 m/s^2", "", lambda rng: np.round(felt(rng) / 2.0) * 2.0),
+    field_row("the same, noise_density and bias_sd as the remark says", "",
+              lambda rng: np.round(felt(rng) / 2.0) * 2.0,
+              {"noise_density": 2.0 / 1000 ** 0.5, "bias_sd": 0.58}),
     field_row("scale of each axis off by 1 %, 1 mm and 2 deg off", "NEES 124", scales_off),
     field_row("scale of each axis off by 1 %, 1 mm and 2 deg off, smoothed", "", scales_off,
               mode="smoothed"),
@@ -353,6 +360,8 @@ FIELD_ROWS = [
     field_row("one of four behind a low-pass of 5 ms, 1 mm and 2 deg off", "", filtered),
     field_row("one of four at a tenth of the rate, 1 mm and 2 deg off", "", seldom),
     field_row("biases drift by 1 m/s^2 in 1 s (bias_walk 0), 1 mm and 2 deg off", "", drifting),
+    field_row("the same, sensor.acc_bias_walk as the remark says", "", drifting,
+              **{"sensor.acc_bias_walk": 1.0}),
     field_row("all behind a low-pass of 5 ms, 1 mm and 2 deg off", "", all_filtered),
     field_row("given rate off by 1 rad/s, 1 mm and 2 deg off", "",
               lambda rng: felt(rng, position_sd=1e-3, axes_sd=0.035),

@@ -19,8 +19,8 @@ class AccelerationFieldEstimatorNode(EstimatorNode):
     PARAMETERS = NODE_PARAMETERS
     OPEN_PREFIXES = SENSOR_PREFIXES
 
-    def set_up(self):
-        super().set_up()
+    def _set_up(self):
+        super()._set_up()
         values = dict(self.open_parameters)
         for cls in NODE_PARAMETERS[1:]:
             values.update(self.params(cls).to_mapping())

@@ -120,12 +120,12 @@ class Node(rclpy.node.Node):
         try:
             self._params = self._declare(params_files)
             self.add_on_set_parameters_callback(self._on_set_parameters)
-            self.set_up()
+            self._set_up()
         except BaseException:
             self.destroy_node()  # else others see it until its memory is freed
             raise
 
-    def set_up(self) -> None:
+    def _set_up(self) -> None:
         """What the node does before it runs; if it raises, nothing of it stays in the graph."""
 
     def params(self, cls: type[P]) -> P:

@@ -68,7 +68,7 @@ class Driver(Node):
     NAME = "driver"
     PARAMETERS = (DriverParams,)
 
-    def set_up(self):
+    def _set_up(self):
         p = self._p = self.params(DriverParams)
         if not p.transport:
             raise ParameterError("parameter 'transport' of node driver: no address given; add -p "

@@ -22,7 +22,7 @@ class EstimatorNode(Node):
 
     TASK = "samples"
 
-    def set_up(self):
+    def _set_up(self):
         self._announcing = ExitStack()
         self._announcing.enter_context(announced_compiling(self.get_logger().info))
         self._stopping = False

@@ -23,8 +23,8 @@ class OrientationEstimatorNode(EstimatorNode):
     NAME = "orientation_estimator"
     PARAMETERS = (EstimatorNodeParams, OrientationParams, OrientationOutputParams)
 
-    def set_up(self):
-        super().set_up()
+    def _set_up(self):
+        super()._set_up()
         output = self.params(OrientationOutputParams)
         warm_up(self.params(OrientationParams))
         self.attach(OrientationStream(self.params(OrientationParams), output,

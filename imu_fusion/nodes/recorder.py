@@ -70,7 +70,7 @@ class Recorder(Node):
     NAME = "recorder"
     PARAMETERS = (RecorderParams,)
 
-    def set_up(self):
+    def _set_up(self):
         p = self._p = self.params(RecorderParams)
         if not p.out:
             raise ParameterError("parameter 'out' of node recorder: no directory given; "

@@ -65,7 +65,7 @@ class Replayer(Node):
     NAME = "replayer"
     PARAMETERS = (ReplayerParams,)
 
-    def set_up(self):
+    def _set_up(self):
         p = self.params(ReplayerParams)
         if not p.bag:
             raise ParameterError("parameter 'bag' of node replayer: no recording given; "

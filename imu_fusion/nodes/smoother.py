@@ -107,8 +107,8 @@ class SmootherNode(EstimatorNode):
     TASK = "collection"
     PARAMETERS = (EstimatorNodeParams, SmootherNodeParams, SmoothingParams)
 
-    def set_up(self):
-        super().set_up()
+    def _set_up(self):
+        super()._set_up()
         p, smoothing_params = self.params(SmootherNodeParams), self.params(SmoothingParams)
         if smoothing_params.surface.file:
             load_surface(smoothing_params.surface.file)

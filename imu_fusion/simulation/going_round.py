@@ -1,4 +1,4 @@
-"""Bodies that go round: vehicles in circles, walkers on laps.
+"""Bodies that go round: vehicles in circles, walkers on laps; and to and fro: swings.
 
 Positions and attitudes in closed form, rates and accelerations from their differences: the truth is
 exact to 1e-6 rad/s and 1e-3 m/s^2, less than any sensor's noise.
@@ -125,3 +125,38 @@ class Walk(_Differences):
         radius = self.radius + 0.03 * share * np.sin(0.5 * step)
         return np.column_stack([radius * np.cos(angle), radius * np.sin(angle),
                                 0.035 * share * np.sin(step)])
+
+
+@dataclass(frozen=True)
+class Swing(_Differences):
+    """At rest, then to and fro on a swing, whose seat twists a little: the force is along its rope.
+
+    seed: of heading, twisting and mounting. rope: m; angle: rad, how far it swings, once it does so
+    after half a minute; twist: rad, .03 to .1 Hz; rest: s.
+    """
+
+    seed: int
+    rope: float = 2.5
+    angle: float = 0.9
+    twist: float = 0.25
+    rest: float = 3.0
+
+    def _parts(self, t):
+        """Angles of rope and seat, (n,) rad, and the heading of the swing."""
+        angle = (self.angle * smooth_step(t, self.rest, 25.0)[0]
+                 * np.sin(math.sqrt(GRAVITY / self.rope) * t))
+        twist = (self.twist * smooth_step(t, self.rest, _FADE)[0]
+                 * waves(self.seed, 0.03, 0.1)(t)[:, 2])
+        heading = np.random.default_rng(self.seed).uniform(0.0, 2.0 * math.pi)
+        return angle, twist, Rotation.from_euler("Z", heading)
+
+    def attitude(self, t: np.ndarray) -> Rotation:
+        """From imu to world axes."""
+        angle, twist, heading = self._parts(t)
+        return (heading * Rotation.from_euler("YZ", np.column_stack([-angle, twist]))
+                * Rotation.random(random_state=self.seed))
+
+    def position(self, t: np.ndarray) -> np.ndarray:
+        """m, world axes."""
+        angle, _, heading = self._parts(t)
+        return heading.apply(self.rope * np.column_stack([np.sin(angle), 0.0 * t, -np.cos(angle)]))

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_fusion.simulation.going_round import Circles, Walk
+from imu_fusion.simulation.going_round import Circles, Swing, Walk
 from imu_fusion.simulation.rotation import GRAVITY
 
 TIME = np.arange(0.0, 20.0, 0.005)
 
 
-@pytest.mark.parametrize("motion", [Circles(1, leans=True), Circles(2, rate=-0.7), Walk(3)],
-                         ids=["leaning", "level", "walk"])
+@pytest.mark.parametrize(
+    "motion", [Circles(1, leans=True), Circles(2, rate=-0.7), Walk(3), Swing(5)],
+    ids=["leaning", "level", "walk", "swing"])
 def test_rates_and_accelerations_are_those_of_the_motion(motion):
     quat, rate, place, acceleration = motion.truth(TIME)
     turn, step = Rotation.from_quat(quat), TIME[1]
@@ -35,3 +36,13 @@ def test_who_leans_into_a_circle_feels_a_larger_gravity_from_where_it_was_at_res
         np.tile(force[0] / GRAVITY * np.hypot(GRAVITY, inwards), (late.sum(), 1)), abs=1e-3)
     assert np.linalg.norm(rates[late], axis=1) == pytest.approx(0.8, abs=1e-6)
     assert np.linalg.norm(place, axis=1) == pytest.approx(4.0)
+
+
+def test_a_swing_pulls_along_its_rope():
+    motion = Swing(6, twist=0.0)
+    quat, _, _, acceleration = motion.truth(TIME)
+    force = Rotation.from_quat(quat).inv().apply(acceleration + [0.0, 0.0, GRAVITY])
+    along = force @ force[0] / GRAVITY
+    # Its push, that which makes it swing further, is across, and small.
+    assert np.linalg.norm(force - along[:, None] * force[0] / GRAVITY, axis=1).max() < 1.5
+    assert along.max() > 1.1 * GRAVITY

@@ -100,7 +100,8 @@ def coarse_remarks(names: list[str], array: SensorArray, params: AccelerationFie
         known = steps[k][np.isfinite(steps[k])]
         if len(known) and known.max() > np.sqrt(12.0) * stated:
             step = float(known.max())
-            needed = step / np.sqrt(12.0 * params.sample_rate)
+            # More than step / sqrt(12): what changes slowly is rounded alike for many samples.
+            needed = step / np.sqrt(params.sample_rate)
             remarks.append(
                 f"accelerometer '{name}' reads in steps of {step:.3g} m/s^2, whose rounding is "
                 f"more than its noise of {stated:.2g}: set accelerometers.{name}.noise_density to "

@@ -148,13 +148,23 @@ def _rotate_all(chain, vectors):
 
 
 @njit
-def _fresh(chain, mag, noise_sd):
-    """Mask (m,) of samples (m, 3) at attitudes (m, 4) that do not repeat an old one."""
-    kept = np.zeros(1, REPEATS)
+def _fresh(kept, chain, mag, noise_sd):
+    """Mask (m,) of samples (m, 3) at attitudes (m, 4) that do not repeat an old one; ``kept``
+    (1,) REPEATS, zero."""
     fresh = np.empty(len(mag), dtype=np.bool_)
     for i in range(len(mag)):
         fresh[i] = not is_stale(kept[0], 0, mag[i], chain[i], noise_sd)
     return fresh
+
+
+def _first_samples(imu_stamps, mag_stamps, mag, chain, noise_sd):
+    """Fresh samples (k, 3) of the magnetometer while there are attitudes (n, 4) of the Imu, and
+    those of the attitudes at their time."""
+    nearest = np.searchsorted(imu_stamps, mag_stamps)
+    mag = np.ascontiguousarray(mag[:max(int(np.sum(nearest < len(chain))), 1)])
+    at_mag = chain[np.clip(nearest[:len(mag)], 0, len(chain) - 1)]
+    fresh = _fresh(np.zeros(1, REPEATS), at_mag, mag, noise_sd)
+    return mag[fresh], at_mag[fresh]
 
 
 def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: np.ndarray,
@@ -188,13 +198,8 @@ def align(imu_stamps: np.ndarray, gyr: np.ndarray, acc: np.ndarray, mag_stamps: 
     nan = float("nan")
     field_first, inclination, field_norm, has_heading = None, nan, nan, False
     if len(mag):
-        nearest = np.searchsorted(imu_stamps, mag_stamps)
-        mag = mag[:max(int(np.sum(nearest < used)), 1)]
-        nearest = np.clip(nearest[:len(mag)], 0, used - 1)
-        mag = np.ascontiguousarray(mag)
-        fresh = _fresh(chain[nearest], mag, p.mag_noise_sd)
-        mag = mag[fresh]
-        field_first = _rotate_all(chain[nearest[fresh]], mag).mean(axis=0)
+        mag, at_mag = _first_samples(imu_stamps, mag_stamps, mag, chain, p.mag_noise_sd)
+        field_first = _rotate_all(at_mag, mag).mean(axis=0)
         field_norm = float(np.linalg.norm(field_first))
         inclination = math.asin(np.clip(-(field_first @ up) / max(field_norm, 1e-30), -1, 1))
         has_heading = math.cos(inclination) > _HORIZONTAL_SHARE
