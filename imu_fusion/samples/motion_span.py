@@ -69,8 +69,10 @@ def find_motion(imu: ImuLog) -> MotionSpan:
              and abs(np.linalg.norm(imu.acc[a:b].mean(axis=0)) - _STANDARD_GRAVITY) < _FORCE_OFF
              and np.linalg.norm(imu.gyr[a:b].mean(axis=0)) < _RATE_OFF]
     if not rests:
-        raise EstimationError(f"no rest of {_SHORTEST} s in the recording: the ball's first "
-                              "attitude is not known; begin the recording before it moves")
+        raise EstimationError(f"no rest of {_SHORTEST} s in the recording (still, force within "
+                              f"{_FORCE_OFF} m/s^2 of gravity, rate below {_RATE_OFF} rad/s): the "
+                              "ball's first attitude is not known; begin the recording before it "
+                              "moves, calibrate what reads otherwise at rest")
     violence = np.concatenate([[0.0], np.cumsum(
         (np.linalg.norm(imu.acc, axis=1) - _STANDARD_GRAVITY) ** 2)])
     begins, ends = [b for _, b in rests], [a for a, _ in rests[1:]] + [len(imu)]
