@@ -77,7 +77,8 @@ class _Motion:
 
     def of_heights(self):
         """What they change by, if heights count twice, from their mean on."""
-        return self.place * (self.height - self.height.mean())[:, None] * [0.0, 0.0, 1.0]
+        mean = self.height.sum() / max(len(self.height), 1)    # without readings there is none
+        return self.place * (self.height - mean)[:, None] * [0.0, 0.0, 1.0]
 
     def of_delay(self):
         """What they change by, if fixes are a second late."""
