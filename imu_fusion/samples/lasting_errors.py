@@ -38,7 +38,7 @@ _WILD = 20.0            # times what all but a hundredth of the samples are off 
 _CLIPPED = 0.999        # of a limit
 _LATE = 0.02            # s: less is a matter of filters
 _FEELS = 5e-3           # rad/s per m/s^2 (3 deg/s per g): fifteen times what gyroscopes feel
-_GRAVITY = 9.81         # m/s^2, turned over within a second: what its bias then changes by
+_GRAVITY = 9.81         # m/s^2, that change as a body is laid on its side: in a second, say
 _CALM = 2e-3            # of it, sd: where the field is as disturbed as that it tells nothing
 # Where a body hardly tumbles, a constant is part of what stands still. How much of its column no
 # other explains, in its mean square: along an axis that is judged, along the others, for the field.
